@@ -73,7 +73,9 @@ def check_name(name: str, kind: str) -> str:
     """Return `name` if it can stand for a quantity, else raise `ExpressionError`."""
     if not isinstance(name, str) or not name.isascii() or not name.isidentifier():
         raise ExpressionError(f"{kind} {name!r} is not a plain ASCII identifier")
-    if keyword.iskeyword(name) or hasattr(builtins, name) or name in FUNCTIONS or name in CONSTANTS or "__" in name:
+    if name.startswith("_") or "__" in name:
+        raise ExpressionError(f"{kind} {name!r}: underscores at the beginning or in a row are kept for generated names")
+    if keyword.iskeyword(name) or hasattr(builtins, name) or name in FUNCTIONS or name in CONSTANTS:
         raise ExpressionError(f"{kind} {name!r} is a reserved word; choose another name")
     if len(name) > 40:
         raise ExpressionError(f"{kind} {name[:40]!r}... is longer than 40 characters")

@@ -1,0 +1,411 @@
+"""Exact arithmetic with the functions that occur in equations of motion.
+
+Entries of inertia tensors and vector fields are rational functions of parameters, coordinates,
+sines, cosines and square roots. As a field that is the rational functions in generators
+(one for each parameter, cosine, sine, root) modulo sin^2 = 1 - cos^2 and root^2 = radicand. An
+`Element` is kept in the normal form N/D with N linear in every sine and root, D free of them, and no
+common factor, so that equal elements are equal objects and zero is seen at once. This is what makes
+the derivation take a fraction of a second where `trigsimp` needs minutes. Very long fractions are left
+uncancelled (see the limits below): zero is still seen, equality is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from operator import add, ge, sub
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from sympy.polys.domains import ZZ
+from sympy.polys.rings import PolyElement, PolyRing
+
+__all__ = ["Algebra", "Element", "exact_quotient"]
+
+# Largest product of the numbers of terms for which a greatest common divisor is sought (0.1 s or
+# so). Beyond it a fraction stays as it is: longer than need be, still exact, and zero is still zero.
+GCD_LIMIT = 6_000
+
+# Longest denominator that is made free of sines and roots (its length is squared by that).
+CONJUGATE_LIMIT = 8
+
+# Derivatives of the functions that are not rational in sines and cosines: f(args) -> df/d(arg) for
+# each argument. SymPy's own rules for abs and sign speak of complex arguments.
+_PARTIALS: dict[Any, Any] = {
+    sp.exp: lambda x: (sp.exp(x),),
+    sp.Abs: lambda x: (sp.sign(x),),
+    sp.sign: lambda x: (sp.S.Zero,),
+    sp.atan2: lambda y, x: (x / (x**2 + y**2), -y / (x**2 + y**2)),
+}
+
+
+class Element:
+    """An element N/D of an `Algebra`, in normal form and immutable."""
+
+    __slots__ = ("algebra", "den", "num")
+
+    def __init__(self, algebra: Algebra, num: PolyElement, den: PolyElement) -> None:
+        self.algebra, self.num, self.den = algebra, num, den
+
+    def __add__(self, other: Element) -> Element:
+        if self.den == other.den:
+            return self.algebra.ratio(self.num + other.num, self.den)
+        return self.algebra.ratio(self.num * other.den + other.num * self.den, self.den * other.den)
+
+    def __sub__(self, other: Element) -> Element:
+        return self + (-other)
+
+    def __neg__(self) -> Element:
+        return Element(self.algebra, -self.num, self.den)
+
+    def __mul__(self, other: Element) -> Element:
+        if not self.num or not other.num:
+            return self.algebra.zero
+        return self.algebra.ratio(self.num * other.num, self.den * other.den)
+
+    def __truediv__(self, other: Element) -> Element:
+        return self.algebra.ratio(self.num * other.den, self.den * other.num)
+
+    def __pow__(self, exponent: int) -> Element:
+        if exponent < 0:
+            return (self.algebra.one / self) ** -exponent
+        return self.algebra.ratio(self.num**exponent, self.den**exponent)
+
+    def __bool__(self) -> bool:
+        return bool(self.num)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Element) and self.num == other.num and self.den == other.den
+
+    def __hash__(self) -> int:
+        return hash((self.num, self.den))
+
+    @property
+    def is_polynomial(self) -> bool:
+        """True if the denominator is 1."""
+        return self.den == 1
+
+
+class Algebra:
+    """The field that contains some expressions and their derivatives.
+
+    Args:
+        expressions: SymPy expressions that will be converted later, over plain symbols.
+        samples: symbol name -> [p] values at p points, at which the expressions are real. A factor
+            of a radicand that is positive at all of them gets a root of its own, so that
+            sqrt(a/b) = sqrt(a)/sqrt(b).
+    """
+
+    def __init__(self, expressions: Iterable[sp.Expr], samples: Mapping[str, Any]) -> None:
+        self._samples = {name: np.asarray(values, dtype=float) for name, values in samples.items()}
+        self._sampled: dict[sp.Expr, Any] = {}  # generator -> its values at the sample points
+        self._units: dict[sp.Expr, int] = {}  # argument of sines -> common denominator of its multiples
+        leaves: dict[sp.Expr, None] = {}
+        radicands: dict[sp.Expr, None] = {}
+        self._collect(list(expressions), leaves, radicands)
+        # Multiples of pi are numbers, not angles.
+        self.angles = {a: (sp.cos(a / unit), sp.sin(a / unit)) for a, unit in self._units.items() if a is not sp.pi}
+        self.generators = [*leaves, *(c for c, _ in self.angles.values()), *(s for _, s in self.angles.values())]
+        self.roots: dict[PolyElement, sp.Expr] = {}  # radicand -> generator
+        self._extend()
+        for radicand in sorted(radicands, key=sp.count_ops):  # an inner root is shorter than its outer one
+            self._declare_root(self.convert(radicand))
+
+    # -- generators ----------------------------------------------------------------------------
+
+    def _collect(self, pending: list[sp.Expr], leaves: dict[sp.Expr, None], radicands: dict[sp.Expr, None]) -> None:
+        """Find symbols, angles, roots and other functions in the expressions and their derivatives."""
+        seen = set()
+        while pending:
+            e = pending.pop()
+            if e in seen:
+                continue
+            seen.add(e)
+            if e.is_Rational:
+                continue
+            if e.func in (sp.sin, sp.cos, sp.tan):
+                for term in sp.Add.make_args(sp.expand(e.args[0])):
+                    factor, core = term.as_coeff_Mul()
+                    self._units[core] = math.lcm(self._units.get(core, 1), sp.Rational(factor).q)
+                    if core is sp.pi:
+                        pending.extend((sp.cos(term), sp.sin(term), sp.cos(core / self._units[core])))
+                    elif not core.is_Symbol:
+                        pending.extend((core, *(sp.diff(core, s) for s in core.free_symbols)))
+            elif e.is_Add or e.is_Mul:
+                pending.extend(e.args)
+            elif e.is_Pow and e.exp.is_Rational and e.exp.q <= 2:
+                pending.append(e.base)
+                if e.exp.q == 2:
+                    radicands[e.base] = None
+            else:
+                leaves[e] = None
+                if e.args:
+                    pending.extend((*e.args, *_partials(e)))
+
+    def _extend(self) -> None:
+        """Make the ring anew after a generator was added."""
+        self.ring = PolyRing(self.generators, ZZ)
+        self._gens = dict(zip(self.generators, self.ring.gens, strict=True))
+        self.one = Element(self, self.ring.one, self.ring.one)
+        self.zero = Element(self, self.ring.zero, self.ring.one)
+        self.roots = {radicand.set_ring(self.ring): g for radicand, g in self.roots.items()}
+        self.radicands = {g: radicand for radicand, g in self.roots.items()}
+        self.circles = [(self._gens[c], self._gens[s]) for c, s in self.angles.values()]
+        # (index of a generator, its square), outermost root first, for `_reduce`
+        self._squares = [(self.ring.index(self._gens[g]), radicand) for radicand, g in reversed(self.roots.items())]
+        self._squares += [(self.ring.index(s), 1 - c**2) for c, s in self.circles]
+        self._converted: dict[sp.Expr, Element] = {}
+        self._rates: dict[tuple[sp.Expr, sp.Symbol], Element] = {}
+
+    def _declare_root(self, radicand: Element) -> None:
+        """Add the generators whose product is the root of `radicand`."""
+        for factor, _ in self._split_radicand(radicand):
+            if factor not in self.roots:
+                # A name of its own: sqrt of an expression could simplify to something else.
+                generator = sp.Symbol(f"root({factor})")
+                self.roots[factor] = generator
+                self.generators.append(generator)
+                self._extend()
+
+    def _split_radicand(self, radicand: Element) -> list[tuple[PolyElement, int]]:
+        """Write a radicand as a product of powers of positive factors, and at most one more factor."""
+        content, factors = radicand.num.factor_list()
+        below, divisors = radicand.den.factor_list()
+        rational = sp.Rational(int(content), int(below))
+        positive: dict[PolyElement, int] = {}
+        rest = self.ring.one
+        sign = 1
+        for factor, power in [*factors, *((f, -p) for f, p in divisors)]:
+            side = self.sign(factor)
+            if side:
+                positive[factor * side] = power
+                sign *= side ** abs(power)
+            else:
+                rest *= factor ** abs(power)
+                if power < 0:  # a/b = a b / b^2, with |b| outside: only even powers of |b| stay exact
+                    positive[factor**2] = positive.get(factor**2, 0) - abs(power)
+        rational *= sign
+        if rational < 0 or rest != 1:
+            rest *= -1 if rational < 0 else 1
+            rational = abs(rational)
+        parts = [*positive.items()]
+        parts += [(self.ring(p), k) for p, k in sp.factorint(rational.p).items() if p > 1]
+        parts += [(self.ring(p), -k) for p, k in sp.factorint(rational.q).items() if p > 1]
+        if rest != 1:
+            parts.append((rest, 1))
+        return [(f.set_ring(self.ring), k) for f, k in parts]
+
+    def sign(self, poly: PolyElement) -> int:
+        """1 or -1 if `poly` has that sign at every sample point, else 0."""
+        values = self._values(poly)
+        return 1 if (values > 0).all() else -1 if (values < 0).all() else 0
+
+    def _values(self, poly: PolyElement) -> Any:
+        """Values [p] of a polynomial at the sample points."""
+        total = np.zeros(len(next(iter(self._samples.values()))))
+        for monomial, coefficient in poly.terms():
+            term = float(coefficient)
+            for generator, exponent in zip(self.generators, monomial, strict=True):
+                if exponent:
+                    term = term * self._generator_values(generator) ** exponent
+            total = total + term
+        return total
+
+    def _generator_values(self, generator: sp.Expr) -> Any:
+        if generator not in self._sampled:
+            with np.errstate(all="ignore"):
+                if generator in self.radicands:
+                    value = np.sqrt(self._values(self.radicands[generator]))
+                else:
+                    function = sp.lambdify([sp.Symbol(name) for name in self._samples], generator, "numpy")
+                    value = function(*self._samples.values())
+            self._sampled[generator] = value
+        return self._sampled[generator]
+
+    # -- normal form ---------------------------------------------------------------------------
+
+    def ratio(self, num: PolyElement, den: PolyElement) -> Element:
+        """Normal form of num/den."""
+        num = self._reduce(num)
+        if den == 1:
+            return Element(self, num, den)
+        den = self._reduce(den)
+        if not den:
+            raise ZeroDivisionError("division by zero in a mechanism's expressions")
+        for index, square in self._squares:
+            even, odd = _split_parity(den, index)
+            if not odd or len(den) > CONJUGATE_LIMIT:
+                continue
+            g = self.ring.gens[index]
+            if even:
+                num, den = self._reduce(num * (even - g * odd)), self._reduce(even**2 - square * odd**2)
+            else:
+                num, den = self._reduce(num * g), self._reduce(odd * square)
+        num, den = num.cancel(den) if len(num) * len(den) <= GCD_LIMIT else _cancel_content(num, den)
+        if den.LC < 0:
+            num, den = -num, -den
+        return Element(self, num, den)
+
+    def _reduce(self, poly: PolyElement) -> PolyElement:
+        """Remainder that is linear in every sine and root."""
+        for index, square in self._squares:
+            poly = _lower(poly, index, square)
+        return poly
+
+    def without_square(self, poly: PolyElement, cosine: PolyElement, sine: PolyElement) -> PolyElement:
+        """Form of `poly` that is linear in the cosine and has powers of the sine instead."""
+        return _lower(poly, self.ring.index(cosine), 1 - sine**2)
+
+    def convert(self, expression: sp.Expr) -> Element:
+        """Element that a SymPy expression stands for."""
+        e = sp.sympify(expression)
+        if e not in self._converted:
+            self._converted[e] = self._convert(e)
+        return self._converted[e]
+
+    def _convert(self, e: sp.Expr) -> Element:
+        if e in self._gens:
+            return Element(self, self._gens[e], self.ring.one)
+        if e.is_Rational:
+            return Element(self, self.ring(int(e.p)), self.ring(int(e.q)))
+        if e.is_Add:
+            total = self.zero
+            for term in e.args:
+                total = total + self.convert(term)
+            return total
+        if e.is_Mul:
+            total = self.one
+            for term in e.args:
+                total = total * self.convert(term)
+            return total
+        if e.is_Pow and e.exp.is_Integer:
+            return self.convert(e.base) ** int(e.exp)
+        if e.is_Pow and e.exp.is_Rational and e.exp.q == 2:
+            return self._root(self.convert(e.base)) ** int(2 * e.exp)
+        if e.func in (sp.sin, sp.cos, sp.tan):
+            cosine, sine = self._circle(e.args[0])
+            return cosine if e.func is sp.cos else sine if e.func is sp.sin else sine / cosine
+        raise ValueError(f"{e} is not made of rational functions, sines, cosines and square roots")
+
+    def _root(self, radicand: Element) -> Element:
+        root = self.one
+        for factor, power in self._split_radicand(radicand):
+            root = root * Element(self, self._gens[self.roots[factor]], self.ring.one) ** power
+        return root
+
+    def _circle(self, argument: sp.Expr) -> tuple[Element, Element]:
+        """(cos, sin) of a sum of multiples of angles, by the addition theorems."""
+        cosine, sine = self.one, self.zero
+        for term in sp.Add.make_args(sp.expand(argument)):
+            factor, core = term.as_coeff_Mul()
+            count = int(factor * self._units[core])
+            c, s = (self.convert(f(core / self._units[core])) for f in (sp.cos, sp.sin))
+            if count < 0:
+                s = -s
+            for _ in range(abs(count)):
+                cosine, sine = cosine * c - sine * s, sine * c + cosine * s
+        return cosine, sine
+
+    # -- calculus ------------------------------------------------------------------------------
+
+    def diff(self, element: Element, symbol: sp.Symbol) -> Element:
+        """Partial derivative of an element with respect to a symbol."""
+        num = self._diff(element.num, symbol)
+        if element.is_polynomial:
+            return num
+        den = Element(self, element.den, self.ring.one)
+        return (num - element * self._diff(element.den, symbol)) / den
+
+    def _diff(self, poly: PolyElement, symbol: sp.Symbol) -> Element:
+        total = self.zero
+        for generator, degree in zip(self.generators, poly.degrees() if poly else (), strict=False):
+            if degree > 0 and (rate := self._rate(generator, symbol)):
+                total = total + Element(self, poly.diff(self._gens[generator]), self.ring.one) * rate
+        return total
+
+    def _rate(self, generator: sp.Expr, symbol: sp.Symbol) -> Element:
+        """Derivative of a generator."""
+        key = (generator, symbol)
+        if key not in self._rates:
+            self._rates[key] = self._derive(generator, symbol)
+        return self._rates[key]
+
+    def _derive(self, g: sp.Expr, symbol: sp.Symbol) -> Element:
+        for radicand, root in self.roots.items():
+            if root == g:
+                rate = self._diff(radicand, symbol)
+                return rate * self.convert(g) / Element(self, 2 * radicand, self.ring.one) if rate else rate
+        for core, (c, s) in self.angles.items():
+            if g in (c, s):
+                rate = self.convert(sp.diff(core, symbol)) / self.convert(sp.Integer(self._units[core]))
+                return -self.convert(s) * rate if g == c else self.convert(c) * rate
+        if g.is_Symbol or not g.args:
+            return self.one if g == symbol else self.zero
+        total = self.zero
+        for partial, argument in zip(_partials(g), g.args, strict=True):
+            total = total + self.convert(partial) * self.diff(self.convert(argument), symbol)
+        return total
+
+
+def _partials(function: sp.Expr) -> tuple[sp.Expr, ...]:
+    if function.func not in _PARTIALS:
+        raise ValueError(f"no derivative is known for {function}")
+    return tuple(_PARTIALS[function.func](*function.args))
+
+
+def _cancel_content(num: PolyElement, den: PolyElement) -> tuple[PolyElement, PolyElement]:
+    """Cancel common integers and powers of generators, and the whole of den if it divides num."""
+    if not num:
+        return num, den.ring.one
+    if (quotient := exact_quotient(num, den)) is not None:
+        return quotient, den.ring.one
+    content = math.gcd(int(num.content()), int(den.content()))
+    monomial = tuple(map(min, zip(*num, *den, strict=True)))
+    return num.quo_term((monomial, ZZ(content))), den.quo_term((monomial, ZZ(content)))
+
+
+def exact_quotient(num: PolyElement, den: PolyElement) -> PolyElement | None:
+    """num/den if that is a polynomial, else None, usually at once: SymPy's `div` goes on to the remainder."""
+    ring = num.ring
+    if len(den) > len(num) or not all(map(ge, num.degrees(), den.degrees())):
+        return None
+    lead, lead_coefficient = den.LT
+    quotient, rest = ring.zero.copy(), num.copy()
+    while rest:
+        monomial, coefficient = rest.LT
+        if coefficient % lead_coefficient or not all(map(ge, monomial, lead)):
+            return None
+        step = tuple(map(sub, monomial, lead))
+        factor = coefficient // lead_coefficient
+        quotient[step] = factor
+        for m, c in den.items():
+            key = tuple(map(add, m, step))
+            if value := rest.get(key, 0) - factor * c:
+                rest[key] = value
+            else:
+                del rest[key]
+    return quotient
+
+
+def _lower(poly: PolyElement, index: int, square: PolyElement) -> PolyElement:
+    """Replace even powers of generator `index` by powers of `square`."""
+    if all(monomial[index] < 2 for monomial in poly):
+        return poly
+    parts: dict[int, PolyElement] = defaultdict(poly.ring.zero.copy)
+    for monomial, coefficient in poly.items():
+        half, odd = divmod(monomial[index], 2)
+        parts[half][(*monomial[:index], odd, *monomial[index + 1 :])] = coefficient
+    return sum((part * square**half for half, part in parts.items()), poly.ring.zero)
+
+
+def _split_parity(poly: PolyElement, index: int) -> tuple[PolyElement, PolyElement]:
+    """(A, B) of poly = A + g B, for poly at most linear in generator `index`."""
+    even, odd = poly.ring.zero.copy(), poly.ring.zero.copy()
+    for monomial, coefficient in poly.items():
+        if monomial[index]:
+            odd[(*monomial[:index], 0, *monomial[index + 1 :])] = coefficient
+        else:
+            even[monomial] = coefficient
+    return even, odd
