@@ -1,0 +1,1 @@
+"""The engine: from equations to scheduled, generated and cached kernels."""

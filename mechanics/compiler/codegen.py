@@ -1,0 +1,405 @@
+"""Expressions to source: straight-line functions and one-step integrators, for any backend.
+
+A `Program` lowers a set of expressions once: subexpressions of parameters alone are hoisted into
+constants, functions and divisions are named, common subexpressions shared. Functions printed
+from it compute only what their outputs need. Names that begin with an underscore are the
+generator's own, names with two in the middle are made from a user's: `mechanics.expressions.check_name`
+lets users have neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from operator import methodcaller
+
+import sympy as sp
+from sympy.printing.pycode import PythonCodePrinter
+
+from mechanics.compiler.dataflow import TAU, Dataflow, initial
+from mechanics.compiler.integrators import Method
+
+__all__ = ["BACKENDS", "Backend", "Program", "operation_count"]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """What differs between targets: the imports and the decorator of a function."""
+
+    name: str
+    header: str
+    decorator: str
+
+
+BACKENDS = {
+    # Scalars or arrays of any shape, no compiler.
+    "numpy": Backend(
+        "numpy",
+        "from numpy import abs as fabs\nfrom numpy import arctan2 as atan2\n"
+        "from numpy import copysign, cos, exp, inf, isfinite, pi, sign, sin, sqrt, tan\n",
+        "",
+    ),
+    # Scalars, inlined into the kernel that calls them. fastmath without nnan and ninf: finiteness
+    # is tested in the same code, and must not be assumed.
+    "numba": Backend(
+        "numba",
+        "from math import atan2, copysign, cos, exp, fabs, inf, isfinite, pi, sin, sqrt, tan\n\n"
+        "from numba import njit\nfrom numpy import sign\n",
+        '@njit(error_model="numpy", fastmath={"contract", "nsz", "arcp"})\n',
+    ),
+}
+
+# d sin = cos * rate, d cos = -sin * rate
+_QUARTER_TURN: dict[type, tuple[type, str]] = {sp.sin: (sp.cos, ""), sp.cos: (sp.sin, "-")}
+
+
+class _Printer(PythonCodePrinter):
+    """Python source of a lowered expression; powers as products, rationals as decimals."""
+
+    def __init__(self) -> None:
+        super().__init__({"fully_qualified_modules": False, "precision": 17})
+
+    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
+        if expr.exp.is_Integer and 2 <= expr.exp <= 4:
+            base = self.parenthesize(expr.base, 60)
+            return f"({'*'.join([base] * int(expr.exp))})"
+        return super()._print_Pow(expr, rational=rational)
+
+    def _print_Rational(self, expr: sp.Rational) -> str:
+        return repr(float(expr))
+
+    def _print_Function(self, expr: sp.Function) -> str:
+        name = {"Abs": "abs"}.get(expr.func.__name__, expr.func.__name__)
+        return f"{name}({', '.join(self._print(argument) for argument in expr.args)})"
+
+    _print_Abs = _print_sign = _print_Function
+
+
+class Program:
+    """A set of named expressions, lowered together.
+
+    Args:
+        outputs: name -> expression.
+        parameters: the symbols that are constant for the life of a kernel.
+    """
+
+    def __init__(self, outputs: Mapping[str, sp.Expr], parameters: Iterable[sp.Symbol]) -> None:
+        self._parameters = frozenset(parameters)
+        self._hoisted: dict[sp.Expr, sp.Symbol] = {}
+        self._definition: dict[sp.Symbol, sp.Expr] = {}
+        self._named: dict[sp.Expr, sp.Symbol] = {}
+        expressions = {name: sp.sympify(expression) for name, expression in outputs.items()}
+        self._roots = {
+            power.base
+            for expression in expressions.values()
+            for power in expression.atoms(sp.Pow)
+            if power.exp.is_Rational and power.exp.q == 2
+        }
+        lowered = {name: self._lower(expression) for name, expression in expressions.items()}
+        temporaries = {symbol: expression for expression, symbol in self._named.items()}
+        # The definitions of named functions take part in the search for common subexpressions.
+        shared, reduced = sp.cse(
+            [*lowered.values(), *temporaries.values()], symbols=sp.numbered_symbols("_s"), order="none"
+        )
+        self.outputs: dict[str, sp.Expr] = dict(zip(lowered, reduced[: len(lowered)], strict=True))
+        self.temporaries: dict[sp.Symbol, sp.Expr] = dict(shared)
+        self.temporaries |= dict(zip(temporaries, reduced[len(lowered) :], strict=True))
+        used = {symbol for expression in self._everything() for symbol in expression.free_symbols}
+        order = [symbol for symbol in self._definition if symbol in used]
+        renamed = {symbol: sp.Symbol(f"_k{i}") for i, symbol in enumerate(order)}
+        self.constants: dict[sp.Symbol, sp.Expr] = {renamed[s]: self._definition[s] for s in order}
+        self.outputs = {name: expression.xreplace(renamed) for name, expression in self.outputs.items()}
+        self.temporaries = {s: expression.xreplace(renamed) for s, expression in self.temporaries.items()}
+
+    def _everything(self) -> list[sp.Expr]:
+        return [*self.outputs.values(), *self.temporaries.values()]
+
+    # -- lowering ------------------------------------------------------------------------------
+
+    def _lower(self, expression: sp.Expr) -> sp.Expr:
+        """Rewrite bottom-up: constants hoisted, functions, roots and divisions named."""
+        if expression.is_Number:
+            return expression
+        if expression.free_symbols <= self._parameters:
+            return self._hoist(expression)
+        if expression.is_Symbol:
+            return expression
+        if expression.is_Pow:
+            return self._lower_power(expression.base, expression.exp)
+        if expression.is_Add:
+            return self._gather(expression, sp.Add)
+        if expression.is_Mul:
+            return self._gather(expression, sp.Mul)
+        return self._name(expression.func(*map(self._lower, expression.args)))
+
+    def _gather(self, expression: sp.Expr, kind: type[sp.Add] | type[sp.Mul]) -> sp.Expr:
+        """Lower a sum or product with its parameter part collected into one constant."""
+        fixed, moving = kind.identity, []
+        for argument in expression.args:
+            # A product inside a product, or a sum inside a sum, brings its own constant.
+            for part in kind.make_args(self._lower(argument)):
+                if part.is_Number or part in self._definition:
+                    fixed = kind(fixed, self._definition.get(part, part))
+                else:
+                    moving.append(part)
+        if kind is sp.Mul and not fixed.is_Number and fixed.could_extract_minus_sign():
+            return kind(-1, self._hoist(-fixed), *moving)
+        return kind(self._hoist(fixed), *moving)
+
+    def _lower_power(self, base: sp.Expr, exponent: sp.Expr) -> sp.Expr:
+        lowered = self._lower(base)
+        if not exponent.is_Rational or exponent.q not in (1, 2):
+            raise ValueError(f"cannot generate code for the power ({base})**({exponent})")
+        if base in self._roots:
+            # One square root serves every power of this base, its inverse included.
+            root = self._name(sp.sqrt(lowered)) if lowered.free_symbols else sp.sqrt(lowered)
+            if exponent < 0:
+                return self._name(1 / root) ** int(-2 * exponent)
+            whole, half = divmod(int(2 * exponent), 2)
+            return lowered**whole * root**half
+        if exponent < 0:
+            return self._name(1 / lowered) ** int(-exponent)
+        return lowered**exponent
+
+    def _hoist(self, expression: sp.Expr) -> sp.Expr:
+        if expression.is_Number:
+            return expression
+        if expression not in self._hoisted:
+            symbol = sp.Symbol(f"_c{len(self._hoisted)}")
+            self._hoisted[expression] = symbol
+            self._definition[symbol] = expression
+        return self._hoisted[expression]
+
+    def _name(self, expression: sp.Expr) -> sp.Symbol:
+        if expression not in self._named:
+            self._named[expression] = sp.Symbol(f"_f{len(self._named)}")
+        return self._named[expression]
+
+    # -- printing ------------------------------------------------------------------------------
+
+    def constants_function(self, name: str, parameters: Sequence[sp.Symbol]) -> str:
+        """Source of `name(p)`: parameter values in the given order -> tuple of constants."""
+        lines = [f"{p.name} = _p[{i}]" for i, p in enumerate(parameters)]
+        printer = _Printer()
+        values = "".join(f"{printer.doprint(expression)},\n" for expression in self.constants.values())
+        return _function(name, ["_p"], [*lines, f"return (\n{_indent(values)})"], "")
+
+    def function(self, name: str, arguments: Sequence[sp.Symbol], outputs: Sequence[str], backend: Backend) -> str:
+        """Source of `name(*arguments, k)` that returns a tuple of the named outputs."""
+        body = _Body(self)
+        point = _Point("", {symbol: symbol.name for symbol in arguments})
+        values = [body.value(self.outputs[output], point) for output in outputs]
+        lines = [*self._unpack(body), *body.lines, f"return ({''.join(f'{value}, ' for value in values)})"]
+        return _function(name, [*(a.name for a in arguments), "_k"], lines, backend.decorator)
+
+    def step_function(
+        self,
+        name: str,
+        flow: Dataflow,
+        method: Method,
+        substeps: int,
+        held: Sequence[sp.Symbol],
+        backend: Backend,
+    ) -> str:
+        """Source of `name(_h, *states, *held, _k)` -> states after _h seconds.
+
+        Outputs of this program must include "rate:STATE" for each state of `flow` that is not
+        exact and "solution:STATE" for each that is.
+        """
+        if flow.core and not method.explicit:
+            core = ", ".join(symbol.name for symbol in flow.core)
+            raise ValueError(
+                f"integrator {method.name!r} would be implicit on ({core}), which need one another; "
+                "choose an explicit one such as 'dop853' or 'rk4', or 'auto'"
+            )
+        body = _Body(self)
+        base = {symbol: symbol.name for symbol in (*flow.states, *held)}
+        base |= {initial(state): state.name for state in flow.states}
+        start, end = _Point("", {**base, TAU: "_h"}), {}
+        stages = [_Stage(self, body, flow, method, i, start) for i in range(method.stages)]
+        for stage in stages:
+            stage.others = stages
+        for layer in flow.layers:
+            if layer.kind == "core":  # stage by stage
+                for stage in stages:
+                    for state in layer.states:
+                        stage.rate(state)
+            for state in layer.states:
+                if layer.kind == "exact":
+                    end[state] = body.value(self.outputs[f"solution:{state.name}"], start)
+                else:
+                    slope = _weighted(method.b, stages, methodcaller("rate", state))
+                    end[state] = f"{state.name} + _h*({slope})"
+        names = [state.name for state in flow.states]
+        values = _indent("".join(f"{end[state]},\n" for state in flow.states))
+        lines = [*body.lines, f"{', '.join(names)}, = (\n{values})"] if names else []
+        if substeps > 1:
+            loop = _indent("\n".join(lines))
+            lines = [f"_h = _h*{1 / substeps!r}", f"for _ in range({substeps}):\n{loop}"]
+        lines = [*self._unpack(body), *lines, f"return ({''.join(f'{n}, ' for n in names)})"]
+        arguments = ["_h", *names, *(symbol.name for symbol in held), "_k"]
+        return _function(name, arguments, lines, backend.decorator)
+
+    def _unpack(self, body: _Body) -> list[str]:
+        return [f"{symbol.name} = _k[{i}]" for i, symbol in enumerate(self.constants) if symbol in body.constants]
+
+
+class _Point:
+    """Where in time expressions are evaluated: names of the symbols there, and what was computed."""
+
+    def __init__(self, suffix: str, names: dict[sp.Expr, str]) -> None:
+        self.suffix = suffix
+        self.names = names
+
+    def resolve(self, symbol: sp.Symbol) -> str | None:
+        return self.names.get(symbol)
+
+
+class _Stage(_Point):
+    """A node of a method: states there are computed when first asked for."""
+
+    def __init__(
+        self, program: Program, body: _Body, flow: Dataflow, method: Method, index: int, start: _Point
+    ) -> None:
+        at_start = method.c[index] == 0 and not any(method.a[index])
+        super().__init__("" if at_start else f"__{index + 1}", start.names if at_start else {})
+        self._program, self._body, self._flow, self._start = program, body, flow, start
+        self._method, self._index, self._at_start = method, index, at_start
+        self._rates: dict[sp.Symbol, str] = {}
+        self._circle_rates: dict[tuple[type, sp.Symbol], str] = {}
+        self.others: list[_Stage] = []
+
+    def resolve(self, symbol: sp.Symbol) -> str | None:
+        if symbol in self.names:
+            return self.names[symbol]
+        if symbol == TAU:
+            self.names[symbol] = self._body.assign(f"_h{self.suffix}", f"_h*{self._method.c[self._index]!r}")
+        elif symbol in self._flow.solutions:
+            value = self._body.value(self._program.outputs[f"solution:{symbol.name}"], self)
+            self.names[symbol] = self._body.assign(f"{symbol.name}{self.suffix}", value)
+        elif symbol in self._flow.rates:
+            row = self._method.a[self._index]
+            value = f"{symbol.name} + _h*({_weighted(row, self.others, methodcaller('rate', symbol))})"
+            self.names[symbol] = self._body.assign(f"{symbol.name}{self.suffix}", value)
+        else:
+            return self._start.resolve(symbol)
+        return self.names[symbol]
+
+    def carries(self, expression: sp.Expr) -> bool:
+        """Whether this is the sine or cosine of an integrated angle under an explicit method."""
+        return (
+            expression.func in _QUARTER_TURN
+            and expression.args[0] in self._flow.rates
+            and expression.args[0] not in self._flow.solutions
+            and self._method.explicit
+            and not self._at_start
+        )
+
+    def circle(self, function: type[sp.sin] | type[sp.cos], angle: sp.Symbol) -> str:
+        """Sine or cosine of an angle, integrated along with it from the beginning of the step.
+
+        Both are states with rates of their own, cos * rate and -sin * rate: a few products where
+        the function itself costs ten times as much. The error is of the method's order.
+        """
+        key = function(angle)
+        if key not in self.names:
+            name = f"_{function.__name__}_{angle.name}{self.suffix}"
+            if self._at_start:
+                value = f"{function.__name__}({angle.name})"
+            else:
+                row = self._method.a[self._index]
+                slope = _weighted(row, self.others, methodcaller("circle_rate", function, angle))
+                value = f"{self.others[0].circle(function, angle)} + _h*({slope})"
+            self.names[key] = self._body.assign(name, value)
+        return self.names[key]
+
+    def circle_rate(self, function: type[sp.sin] | type[sp.cos], angle: sp.Symbol) -> str:
+        key = (function, angle)
+        if key not in self._circle_rates:
+            partner, sign = _QUARTER_TURN[function]
+            value = f"{sign}{self.circle(partner, angle)}*{self.rate(angle)}"
+            name = f"_r_{function.__name__}_{angle.name}__{self._index + 1}"
+            self._circle_rates[key] = self._body.assign(name, value)
+        return self._circle_rates[key]
+
+    def rate(self, state: sp.Symbol) -> str:
+        if state not in self._rates:
+            value = self._body.value(self._program.outputs[f"rate:{state.name}"], self)
+            self._rates[state] = self._body.assign(f"_r_{state.name}__{self._index + 1}", value)
+        return self._rates[state]
+
+
+class _Body:
+    """Lines of a function under construction."""
+
+    def __init__(self, program: Program) -> None:
+        self.lines: list[str] = []
+        self.constants: set[sp.Symbol] = set()
+        self._program = program
+        self._printer = _Printer()
+        self._fixed: dict[sp.Symbol, str] = {}  # temporaries that hold over the whole step
+        self._moving: dict[sp.Symbol, bool] = {}
+
+    def assign(self, name: str, value: str) -> str:
+        self.lines.append(f"{name} = {value}")
+        return name
+
+    def value(self, expression: sp.Expr, point: _Point) -> str:
+        """Source of `expression` at `point`, what it needs emitted before."""
+        return self._printer.doprint(expression.xreplace(self._names(expression, point)))
+
+    def _names(self, expression: sp.Expr, point: _Point) -> dict[sp.Symbol, sp.Symbol]:
+        names = {}
+        for symbol in sorted(expression.free_symbols, key=lambda s: s.name):
+            names[symbol] = sp.Symbol(self._resolve(symbol, point))
+        return names
+
+    def _resolve(self, symbol: sp.Symbol, point: _Point) -> str:
+        program = self._program
+        if symbol in program.constants:
+            self.constants.add(symbol)
+            return symbol.name
+        if symbol in program.temporaries:
+            if not isinstance(point, _Stage) or self._moves(symbol, point):
+                if symbol not in point.names:
+                    expression = program.temporaries[symbol]
+                    if isinstance(point, _Stage) and point.carries(expression):
+                        point.names[symbol] = point.circle(expression.func, expression.args[0])
+                    else:
+                        value = self.value(expression, point)
+                        point.names[symbol] = self.assign(f"{symbol.name}{point.suffix}", value)
+                return point.names[symbol]
+            return self._resolve(symbol, point._start)
+        name = point.resolve(symbol)
+        if name is None:
+            raise KeyError(f"{symbol} is neither an argument nor computed")
+        return name
+
+    def _moves(self, symbol: sp.Symbol, stage: _Stage) -> bool:
+        """Whether a temporary depends on the stage at which it is evaluated."""
+        if symbol not in self._moving:
+            self._moving[symbol] = any(
+                inner == TAU
+                or inner in stage._flow.rates
+                or (inner in self._program.temporaries and self._moves(inner, stage))
+                for inner in self._program.temporaries[symbol].free_symbols
+            )
+        return self._moving[symbol]
+
+
+def operation_count(program: Program) -> int:
+    """Additions, multiplications, divisions, roots and functions of all outputs together."""
+    return int(sum(sp.count_ops(expression) for expression in program._everything()))
+
+
+def _weighted(weights: Sequence[float], stages: Sequence[_Stage], rate: Callable[[_Stage], str]) -> str:
+    """Weighted sum of rates; those of weight zero are not even computed."""
+    return " + ".join(f"{weight!r}*{rate(stage)}" for weight, stage in zip(weights, stages, strict=True) if weight)
+
+
+def _function(name: str, arguments: Sequence[str], lines: Sequence[str], decorator: str) -> str:
+    return f"{decorator}def {name}({', '.join(arguments)}):\n" + _indent("\n".join(lines)) + "\n"
+
+
+def _indent(text: str) -> str:
+    return "".join(f"    {line}\n" if line.strip() else "\n" for line in text.splitlines())

@@ -1,0 +1,221 @@
+"""Methods as data: their tableaux, and what one generated step of each of them does."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.integrate import solve_ivp
+
+from mechanics.compiler.integrators import Method, method, method_names
+
+GAUSS = [name for name in method_names() if name.startswith("gauss")]
+EXPLICIT = [name for name in method_names() if method(name).explicit]
+
+y1, y2, z1, z2 = sp.symbols("y1 y2 z1 z2")
+# A pendulum (a core) and a quadrature behind it; a chain in which each rate uses what is before it.
+COUPLED = {y1: y2, y2: -sp.sin(y1), z1: sp.cos(y1) * y2**2}
+LAYERED = {y1: sp.Integer(1), y2: sp.cos(y1), z1: sp.sin(y2) * sp.cos(y1), z2: sp.cos(z1) * y2}
+START = {y1: 0.4, y2: 0.9, z1: -0.2, z2: 0.3}
+
+
+def _arrays(name):
+    row = method(name)
+    return np.array(row.a), np.array(row.b), np.array(row.c)
+
+
+# -- tableaux -----------------------------------------------------------------------------------
+
+
+def test_the_methods_are_those_of_the_documentation():
+    assert set(method_names()) == {"rk4", "dop853", "gauss1", "gauss2", "gauss3", "gauss4", "gauss5", "gauss6"}
+    orders = {name: method(name).order for name in method_names()}
+    assert orders == {"rk4": 4, "dop853": 8, **{f"gauss{s}": 2 * s for s in range(1, 7)}}
+    assert set(EXPLICIT) == {"rk4", "dop853"}
+    assert all(method(name).source for name in method_names())
+
+
+def test_an_unknown_method_is_refused_with_a_suggestion():
+    with pytest.raises(ValueError, match="unknown integrator 'dopri853'.*known: auto, rk4, .*Did you mean 'dop853'"):
+        method("dopri853")
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_order_conditions_of_rooted_trees(name):
+    """All eight conditions up to order 4, of which `Method` itself checks the bushy ones only."""
+    a, b, c = _arrays(name)
+    conditions = [
+        (b.sum(), 1, 1),
+        (b @ c, 2, 2),
+        (b @ c**2, 3, 3),
+        (b @ a @ c, 6, 3),
+        (b @ c**3, 4, 4),
+        ((b * c) @ a @ c, 8, 4),
+        (b @ a @ c**2, 12, 4),
+        (b @ a @ a @ c, 24, 4),
+    ]
+    for value, inverse, order in conditions:
+        if order <= method(name).order:
+            # Dormand-Prince 8 has weights up to 43, whose roundings add up to 1e-14.
+            assert value == pytest.approx(1 / inverse, rel=0, abs=1e-13)
+
+
+@pytest.mark.parametrize("name", GAUSS)
+def test_gauss_is_collocation_at_legendre_nodes(name):
+    """B(2s), C(s) and D(s), and NumPy's own nodes and weights."""
+    a, b, c = _arrays(name)
+    s = len(b)
+    nodes, weights = np.polynomial.legendre.leggauss(s)
+    assert c == pytest.approx((1 + nodes) / 2, rel=0, abs=1e-15)  # eight digits of float64 after the first
+    assert b == pytest.approx(weights / 2, rel=0, abs=1e-15)
+    for k in range(1, 2 * s + 1):
+        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=0, abs=1e-15)
+    for k in range(1, s + 1):
+        assert a @ c ** (k - 1) == pytest.approx(c**k / k, rel=0, abs=1e-15)
+        assert (b * c ** (k - 1)) @ a == pytest.approx(b * (1 - c**k) / k, rel=0, abs=1e-15)
+    # Symmetric and symplectic.
+    assert a + a[::-1, ::-1] == pytest.approx(np.tile(b, (s, 1)), rel=0, abs=1e-15)
+    assert b[:, None] * a + (b[:, None] * a).T == pytest.approx(np.outer(b, b), rel=0, abs=1e-15)
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_a_broken_tableau_is_refused(name):
+    """Any coefficient wrong in its eleventh digit, or an order that it does not have."""
+    good = method(name)
+    s = good.stages
+    places = [("b", (i,)) for i in range(s)] + [("c", (i,)) for i in range(s)]
+    places += [("a", pair) for pair in itertools.product(range(s), range(s))]
+    for field, place in places:
+        numbers = np.array(getattr(good, field))
+        numbers[place] += 1e-11
+        changed = tuple(map(tuple, numbers)) if numbers.ndim == 2 else tuple(numbers)
+        with pytest.raises(ValueError, match=f"{name} violates"):
+            dataclasses.replace(good, **{field: changed})
+    with pytest.raises(ValueError, match="violates 'sum b c"):
+        dataclasses.replace(good, order=good.order + 1)
+    for field in ("a", "b", "c"):
+        with pytest.raises(ValueError, match="must be s x s"):
+            dataclasses.replace(good, **{field: getattr(good, field)[:-1]})
+
+
+def test_a_consistent_tableau_is_accepted():
+    heun = Method("heun", ((0.0, 0.0), (1.0, 0.0)), (0.5, 0.5), (0.0, 1.0), 2, "Heun 1900")
+    assert heun.explicit
+    assert heun.stages == 2
+
+
+# -- steps --------------------------------------------------------------------------------------
+
+
+def _reference(rates, end):
+    """State at time `end`, by SciPy at its tightest."""
+    function = sp.lambdify([list(rates)], list(rates.values()))
+    run = solve_ivp(lambda t, y: function(y), (0, end), [START[s] for s in rates], "DOP853", rtol=3e-14, atol=1e-15)
+    return run.y[:, -1]
+
+
+def _error(step, rates, end, steps, reference):
+    state = {s: START[s] for s in rates}
+    for _ in range(steps):
+        state = step(end / steps, state)
+    return np.abs(np.array([state[s] for s in rates]) - reference).max()
+
+
+# Time, and numbers of steps between which the order is read off: small enough for the leading term of the error to
+# rule, errors large enough to stand above the reference's own 1e-14.
+STEPS = {
+    "rk4": (2.0, 32, 64),
+    "dop853": (4.0, 8, 16),
+    "gauss1": (2.0, 32, 64),
+    "gauss2": (2.0, 16, 32),
+    "gauss3": (2.0, 8, 16),
+    "gauss4": (4.0, 8, 16),
+    "gauss5": (4.0, 2, 8),
+    "gauss6": (8.0, 8, 16),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "system"), [*((n, "layered") for n in method_names()), *((n, "coupled") for n in EXPLICIT)]
+)
+def test_observed_order(name, system, stepper):
+    rates = LAYERED if system == "layered" else COUPLED
+    end, coarse, fine = STEPS[name]
+    _, step = stepper(rates, list(rates), name)
+    reference = _reference(rates, end)
+    errors = [_error(step, rates, end, n, reference) for n in (coarse, fine)]
+    assert errors[1] > 1e-13
+    # Finite steps: the next term of the expansion shifts what is observed by a few tenths.
+    assert np.log(errors[0] / errors[1]) / np.log(fine / coarse) == pytest.approx(method(name).order, abs=0.5)
+
+
+@pytest.mark.parametrize("name", GAUSS)
+def test_an_implicit_method_is_refused_on_a_core(name, stepper):
+    with pytest.raises(ValueError, match=r"would be implicit on \(y1, y2\).*'dop853'"):
+        stepper(COUPLED, list(COUPLED), name)
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_time_reversal(name, stepper):
+    """A step forth and a step back: home, to rounding, for the symmetric methods and for no others."""
+    rates = COUPLED if method(name).explicit else LAYERED
+    _, step = stepper(rates, list(rates), name)
+    there = step(0.8, START)
+    back = step(-0.8, there)
+    miss = max(abs(back[s] - START[s]) for s in rates)
+    if name in GAUSS:
+        assert miss < 1e-15  # a few roundings of numbers of order 1
+    else:
+        assert miss > 1e-10
+
+
+@pytest.mark.parametrize("name", ["rk4", "gauss3"])
+def test_substeps_are_steps(name, stepper):
+    """`substeps=4` is four steps of a quarter, bit for bit."""
+    rates = COUPLED if method(name).explicit else LAYERED
+    _, once = stepper(rates, list(rates), name)
+    _, split = stepper(rates, list(rates), name, substeps=4)
+    state = dict(START)
+    for _ in range(4):
+        state = once(0.1, state)
+    assert split(0.4, START) == state
+
+
+@pytest.mark.parametrize("name", ["dop853", "gauss4"])
+def test_numpy_and_numba_agree(name, stepper):
+    """The same source for both; the compiler may contract a product and a sum into one rounding."""
+    rates = COUPLED if method(name).explicit else LAYERED
+    _, plain = stepper(rates, list(rates), name)
+    _, compiled = stepper(rates, list(rates), name, backend="numba")
+    a, b = dict(START), dict(START)
+    for _ in range(10):
+        a, b = plain(0.1, a), compiled(0.1, b)
+    assert [float(a[s]) for s in rates] == pytest.approx([b[s] for s in rates], rel=1e-13, abs=1e-13)
+
+
+def test_numpy_steps_many_states_at_once(stepper):
+    """Arrays of any shape in, row by row what scalars give."""
+    _, step = stepper(COUPLED, list(COUPLED), "rk4")
+    shift = np.linspace(-1, 1, 6).reshape(2, 3)
+    many = step(0.1, {s: START[s] + shift for s in COUPLED})
+    for place in np.ndindex(shift.shape):
+        one = step(0.1, {s: START[s] + shift[place] for s in COUPLED})
+        # Vectorised sine and cosine may round otherwise.
+        assert [many[s][place] for s in COUPLED] == pytest.approx([one[s] for s in COUPLED], rel=1e-14)
+
+
+@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize("h", [0.05, 3.0])
+def test_exact_layers_are_closed_forms(name, h, stepper):
+    """Where the rate is a polynomial in time, the method does not matter, nor does the step."""
+    u = sp.Symbol("u")
+    v, q, a = sp.symbols("v q a")
+    flow, step = stepper({v: 2 * u, q: v, a: q + 1}, [a], name, held=[u])
+    assert {layer.kind for layer in flow.layers} == {"exact"}
+    v0, q0, a0, u0 = 0.3, -0.7, 1.1, 0.9
+    end = step(h, {v: v0, q: q0, a: a0}, [u0])
+    # A polynomial of four terms, rounded.
+    assert end[v] == pytest.approx(v0 + 2 * u0 * h, rel=4e-16)
+    assert end[q] == pytest.approx(q0 + v0 * h + u0 * h**2, rel=1e-15)
+    assert end[a] == pytest.approx(a0 + (q0 + 1) * h + v0 * h**2 / 2 + u0 * h**3 / 3, rel=1e-15)
