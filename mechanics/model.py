@@ -1,0 +1,177 @@
+"""`Model`: the reduced equations of a mechanism as numerical functions.
+
+Derived once, cached as NumPy source, and vectorised: every method takes arrays whose last axis
+counts coordinates, pseudo-velocities or controls, and any leading axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mechanics.compiler import kernels
+from mechanics.mechanism import Mechanism, MechanismError
+
+if TYPE_CHECKING:
+    from mechanics.geometry.reduction import ReducedEquations
+
+__all__ = ["Model", "acceleration"]
+
+Array = NDArray[np.float64]
+
+# A velocity counts as feasible if what violates the constraints is rounding: states printed with
+# 15 digits leave 1e-14 of the speed, a typing error leaves the order of the speed.
+CONSTRAINT_TOLERANCE = 1e-8
+
+
+class Model:
+    """Numerical functions of one mechanism in one frame.
+
+    Args:
+        mechanism: what moves.
+        params: values that replace the mechanism's defaults.
+        frame: as in `mechanics.reduce`.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        params: Mapping[str, float] | None = None,
+        frame: str | Sequence[Sequence[str]] | None = None,
+    ) -> None:
+        self.mechanism = mechanism
+        self.params = mechanism.resolve(params)
+        rows = mechanism.frame_rows(frame)
+        specification = {"mechanism": mechanism.to_dict(), "frame": rows}
+        self._functions = kernels.load(f"{mechanism.name}_model", specification, lambda: _source(mechanism, rows))
+        self._constants = np.array(self._functions.constants(list(self.params.values())))
+
+    def project(self, q: ArrayLike, qdot: ArrayLike) -> Array:
+        """Pseudo-velocities v (..., k) of velocities q̇ (..., n), orthogonally projected onto D."""
+        return self._call("project", (q, self.mechanism.n, "q"), (qdot, self.mechanism.n, "qdot"))
+
+    def feasible(self, q: ArrayLike, qdot: ArrayLike) -> Array:
+        """Pseudo-velocities v (..., k) of q̇ (..., n); raise `MechanismError` where q̇ is not in D."""
+        v = self.project(q, qdot)
+        given, projected = np.asarray(qdot, dtype=float), self.velocity(q, v)
+        error = np.linalg.norm(given - projected, axis=-1)
+        if not (error <= CONSTRAINT_TOLERANCE * np.maximum(1.0, np.linalg.norm(given, axis=-1))).all():
+            raise MechanismError(
+                f"{self.mechanism.name}: qdot = {given.tolist()} violates the rolling constraints by "
+                f"{np.max(error):.3g}; the nearest feasible velocity is {projected.tolist()}"
+            )
+        return v
+
+    def velocity(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Velocities q̇ = X(q) v, shape (..., n)."""
+        return self._call("velocity", (q, self.mechanism.n, "q"), (v, self.mechanism.rank, "v"))
+
+    def rates(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
+        """Rates of the pseudo-velocities, -Γ̃(q) v v + Y(q) u + potential part, shape (..., k)."""
+        return self._call("rates", *self._state(q, v), (u, len(self.mechanism.forces), "u"))
+
+    def acceleration(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
+        """Accelerations q̈ (..., n) that the rates and the constraints give."""
+        return self._call("acceleration", *self._state(q, v), (u, len(self.mechanism.forces), "u"))
+
+    def energy(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Kinetic plus potential energy in J, shape (...)."""
+        return self._call("energy", *self._state(q, v))[..., 0]
+
+    def power(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
+        """Power sum_a u_a <F_a, q̇> of the controls in W, shape (...)."""
+        return self._call("power", *self._state(q, v), (u, len(self.mechanism.forces), "u"))[..., 0]
+
+    def constraint_residual(self, q: ArrayLike, qdot: ArrayLike) -> Array:
+        """Values of the c constraint one-forms on q̇, shape (..., c); zero on feasible velocities."""
+        return self._call("residual", (q, self.mechanism.n, "q"), (qdot, self.mechanism.n, "qdot"))
+
+    def scalar_rates(self, state: Sequence[float], u: Sequence[float]) -> tuple[float, ...]:
+        """Rates of (q, v, work) as a tuple: the right-hand side for an ODE solver, nothing checked."""
+        return self._functions.right_hand_side(*state, *u, self._constants)
+
+    def _state(self, q: ArrayLike, v: ArrayLike) -> tuple[tuple[ArrayLike, int, str], ...]:
+        return (q, self.mechanism.n, "q"), (v, self.mechanism.rank, "v")
+
+    def _call(self, name: str, *arguments: tuple[ArrayLike, int, str]) -> Array:
+        columns: list[Array] = []
+        for value, size, label in arguments:
+            array = np.asarray(value, dtype=float)
+            if array.shape[-1:] != (size,):
+                raise MechanismError(f"{self.mechanism.name}: {label} must have shape (..., {size}), got {array.shape}")
+            columns.extend(np.moveaxis(array, -1, 0))
+        result = getattr(self._functions, name)(*columns, self._constants)
+        if not result:
+            return np.zeros((*np.shape(columns[0]), 0))
+        return np.stack(np.broadcast_arrays(*result), axis=-1).astype(float)
+
+
+def acceleration(
+    mechanism: Mechanism,
+    q: ArrayLike,
+    qdot: ArrayLike,
+    u: ArrayLike,
+    params: Mapping[str, float] | None = None,
+) -> Array:
+    """Accelerations q̈ of a mechanism under its constraints: numbers in, numbers out.
+
+    Args:
+        mechanism: what moves.
+        q: coordinates, shape (..., n).
+        qdot: feasible velocities, shape (..., n).
+        u: controls, shape (..., m).
+        params: values that replace the mechanism's defaults.
+    """
+    model = Model(mechanism, params)
+    return model.acceleration(q, model.feasible(q, qdot), u)
+
+
+def _source(mechanism: Mechanism, rows: Any) -> str:
+    """Generate the NumPy module of a mechanism in a frame."""
+    import sympy as sp
+
+    from mechanics.compiler.codegen import BACKENDS, Program
+    from mechanics.geometry.reduction import reduce
+
+    equations: ReducedEquations = reduce(mechanism, rows)
+    q, v, u = equations.coordinates, equations.pseudo_velocities, equations.controls
+    qdot = sp.symbols([f"{c.name}__dot" for c in q])
+    forms = [[mechanism.symbolic(text) for text in row] for row in mechanism.one_forms]
+    forces = [[mechanism.symbolic(text) for text in row] for row in mechanism.forces.values()]
+    rate_of = dict(zip((*q, *v), (*equations.velocity, *equations.acceleration), strict=True))
+    power = sum(
+        (
+            ua * fi * vi
+            for ua, row in zip(u, forces, strict=True)
+            for fi, vi in zip(row, equations.velocity, strict=True)
+        ),
+        sp.S.Zero,
+    )
+    groups: dict[str, tuple[tuple[Any, ...], list[sp.Expr]]] = {
+        "project": ((*q, *qdot), list(equations.projection * sp.Matrix(qdot))),
+        "velocity": ((*q, *v), list(equations.velocity)),
+        "rates": ((*q, *v, *u), list(equations.acceleration)),
+        # The derivative of X(q) v along the motion.
+        "acceleration": (
+            (*q, *v, *u),
+            [sum((sp.diff(e, s) * r for s, r in rate_of.items()), sp.S.Zero) for e in equations.velocity],
+        ),
+        "energy": ((*q, *v), [equations.energy]),
+        "power": ((*q, *v, *u), [power]),
+        "residual": ((*q, *qdot), [sum(a * b for a, b in zip(row, qdot, strict=True)) for row in forms]),
+        "right_hand_side": ((*q, *v, sp.Symbol("_work"), *u), [*rate_of.values(), power]),
+    }
+    outputs = {f"{group}:{i}": e for group, (_, es) in groups.items() for i, e in enumerate(es)}
+    program = Program(outputs, equations.parameters)
+    numpy = BACKENDS["numpy"]
+    functions = [
+        program.function(group, arguments, [f"{group}:{i}" for i in range(len(expressions))], numpy)
+        for group, (arguments, expressions) in groups.items()
+    ]
+    title = f'"""{mechanism.name}: numerical functions in the frame {[list(row) for row in rows]}. Do not edit."""\n'
+    return "\n\n".join(
+        [title + numpy.header, program.constants_function("constants", equations.parameters), *functions]
+    )
