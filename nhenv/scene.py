@@ -1,0 +1,127 @@
+"""`Scene`: a mechanism, a task and options, compiled to the one kernel that environments run.
+
+The kernel works on a flat float64 memory, whose parts its table MEMORY names:
+
+    step(memory, observation, *action) -> (status, reward, *reward terms, *info)
+
+It clips the action, integrates one hold through every impact on a stop, and judges the outcome.
+States that nothing observed, rewarded or reported depends on are not in it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mechanics.compiler import kernels
+from mechanics.compiler.integrators import method_names
+from mechanics.expressions import unknown_name
+from mechanics.mechanism import Mechanism
+from nhenv.tasks import Task
+
+__all__ = ["BAD_ACTION", "DIVERGED", "HISTORY_FULL", "RUNNING", "Scene"]
+
+RUNNING, BAD_ACTION, DIVERGED, HISTORY_FULL = 0.0, 1.0, 2.0, 3.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is simulated, observed and rewarded.
+
+    Attributes:
+        mechanism: what moves.
+        task: what it is for; None for a scene that only integrates the whole state.
+        frame: frame in which the reduced equations are integrated; None for the default.
+        stops: whether joint limits act.
+        integrator: name of a method, or "auto".
+        substeps: steps of the method in a hold; None for the default.
+        backend: "numba" or "numpy".
+    """
+
+    mechanism: Mechanism
+    task: Task | None
+    frame: str | None = None
+    stops: bool = True
+    integrator: str = "auto"
+    substeps: int | None = None
+    backend: str = "numba"
+
+    def __post_init__(self) -> None:
+        if self.integrator not in ("auto", *method_names()):
+            raise ValueError(unknown_name("integrator", str(self.integrator), ("auto", *method_names())))
+        self.mechanism.frame_rows(self.frame)  # refuses a name that is not there
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the numbers that `constants` of the kernel takes, in order."""
+        weights = self.task.weights if self.task else ()
+        return (*self.mechanism.parameters, *weights, "dt", "forward")
+
+    @cached_property
+    def joints(self) -> tuple[str, ...]:
+        """Coordinates that have stops in this scene."""
+        return tuple(self.mechanism.joint_limits) if self.stops else ()
+
+    @cached_property
+    def kernel(self) -> ModuleType:
+        """The compiled module, from the cache if possible."""
+        specification = self.__getstate__()
+        specification["mechanism"] = self.mechanism.to_dict()
+        specification["task"] = dataclasses.asdict(self.task) if self.task else None
+        name = f"{self.mechanism.name}_{self.task.name if self.task else 'state'}_{self.backend}"
+        folder = Path(__file__).parent
+        return kernels.load(name, specification, self.source, deriving=(folder / "scene.py", folder / "generate.py"))
+
+    @cached_property
+    def whole(self) -> Scene:
+        """The same motion with nothing left out and nothing judged."""
+        return dataclasses.replace(self, task=None)
+
+    def new_memory(
+        self, numbers: Mapping[str, float], torque_limits: Iterable[float], stops: Iterable[float]
+    ) -> NDArray[np.float64]:
+        """Memory for one environment.
+
+        Args:
+            numbers: a value for each of `parameters`.
+            torque_limits: (m,) largest torques.
+            stops: (joints,) largest angles.
+        """
+        memory, places = np.zeros(self.kernel.SIZE), self.kernel.MEMORY
+        memory[slice(*places["k"])] = self.kernel.constants([numbers[name] for name in self.parameters])
+        memory[slice(*places["dt"])] = numbers["dt"]
+        memory[slice(*places["limit"])] = list(torque_limits)
+        memory[slice(*places["stop"])] = list(stops)
+        return memory
+
+    def put(self, memory: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+        """Write a state, q (n,) and v (k,), into a memory."""
+        values = dict(zip(self.states, (*q, *v), strict=True))
+        memory[slice(*self.kernel.MEMORY["state"])] = [values[name] for name in self.kernel.STATES]
+
+    def values(self, memory: NDArray[np.float64]) -> dict[str, float]:
+        """Value of each state that this scene follows, by name."""
+        return dict(zip(self.kernel.STATES, memory[slice(*self.kernel.MEMORY["state"])].tolist(), strict=True))
+
+    @cached_property
+    def states(self) -> tuple[str, ...]:
+        """Names of all states of the mechanism: coordinates, then pseudo-velocities."""
+        return (*self.mechanism.coordinates, *(f"v{i + 1}" for i in range(self.mechanism.rank)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the kernel, which is loaded again."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def source(self) -> str:
+        """Derive the source of the kernel; `kernel` calls this when the cache has none."""
+        from nhenv.generate import kernel_source
+
+        return kernel_source(self)

@@ -1,0 +1,290 @@
+"""What an environment refuses, and that it says what was given and what to do.
+
+Each case lists words that the message must contain, in any order: what was given, what is known or expected.
+"""
+
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import nhenv
+from mechanics.mechanism import MechanismError
+from nhenv.env import LocomotionEnv
+
+SNAKEBOARD, RACER = "nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0"
+
+
+def _message(error, *words):
+    text = str(error.value)
+    missing = [word for word in words if word not in text]
+    assert not missing, f"{missing} not in {text!r}"
+
+
+# -- arguments ----------------------------------------------------------------------------------
+
+ARGUMENTS = {
+    "unknown parameter": (SNAKEBOARD, {"params": {"J_rr": 0.1}}, MechanismError, ["'J_rr'", "J_w", "mean 'J_r'"]),
+    "impossible inertia": (SNAKEBOARD, {"params": {"J_r": 0.25}}, MechanismError, ["positive definite", "J_r=0.25"]),
+    # m l^2 exactly: the tensor is singular.
+    "singular inertia": (SNAKEBOARD, {"params": {"m": 4.0, "l": 0.5, "J_r": 1.0}}, MechanismError, ["definite", "m=4"]),
+    "negative mass": (RACER, {"params": {"m": -1.0}}, MechanismError, ["positive definite", "m=-1"]),
+    "no mass": (RACER, {"params": {"I_1": 0.0}}, MechanismError, ["positive definite", "I_1=0"]),
+    "NaN parameter": (RACER, {"params": {"l_1": np.nan}}, MechanismError, ["l_1", "nan", "not finite"]),
+    "infinite parameter": (SNAKEBOARD, {"params": {"m": np.inf}}, MechanismError, ["m", "inf", "not finite"]),
+    "parameter no number": (RACER, {"params": {"l_1": "long"}}, MechanismError, ["l_1", "number", "'long'"]),
+    "neither way": (RACER, {"params": {"l_2": 0.03}}, ValueError, ["l_1*I_2 - l_2*I_1 = 0", "change a parameter"]),
+    "dt zero": (SNAKEBOARD, {"dt": 0}, ValueError, ["dt", "positive", "got 0"]),
+    "dt negative": (SNAKEBOARD, {"dt": -0.05}, ValueError, ["dt", "positive", "-0.05"]),
+    "dt NaN": (RACER, {"dt": np.nan}, ValueError, ["dt", "positive and finite", "nan"]),
+    "dt no number": (RACER, {"dt": "slow"}, ValueError, ["dt", "number", "'slow'"]),
+    "integrator misspelt": (SNAKEBOARD, {"integrator": "gaus4"}, ValueError, ["'gaus4'", "auto", "mean 'gauss4'"]),
+    "integrator implicit": (RACER, {"integrator": "gauss4"}, ValueError, ["'gauss4'", "implicit", "psi", "'dop853'"]),
+    "frame misspelt": (RACER, {"frame": "regulr"}, MechanismError, ["'regulr'", "paper", "mean 'regular'"]),
+    "mechanism misspelt": (RACER, {"mechanism": "roler_racer"}, MechanismError, ["'roler_racer'", "known", "mean"]),
+    "task misspelt": (SNAKEBOARD, {"task": "Foward"}, ValueError, ["'Foward'", "known", "mean 'Forward'"]),
+    "weight misspelt": (RACER, {"ctrl_cost_wieght": 0.1}, TypeError, ["'ctrl_cost_wieght'", "mean 'ctrl_cost_weight'"]),
+    "weight NaN": (RACER, {"ctrl_cost_weight": np.nan}, ValueError, ["ctrl_cost_weight", "finite", "nan"]),
+    "substeps zero": (RACER, {"substeps": 0}, ValueError, ["substeps", "positive whole", "got 0"]),
+    "substeps fraction": (RACER, {"substeps": 1.5}, ValueError, ["substeps", "whole", "1.5"]),
+    "noise negative": (RACER, {"reset_noise_scale": -0.1}, ValueError, ["reset_noise_scale", "at least 0", "-0.1"]),
+    "noise to the stop": (SNAKEBOARD, {"reset_noise_scale": 1.2}, ValueError, ["reset_noise_scale", "1.2", "below"]),
+    "noise NaN": (RACER, {"reset_noise_scale": np.nan}, ValueError, ["reset_noise_scale", "nan"]),
+    "torque limit unknown": (SNAKEBOARD, {"torque_limits": {"u_phy": 1}}, ValueError, ["'u_phy'", "mean 'u_phi'"]),
+    "torque limit zero": (SNAKEBOARD, {"torque_limits": [1, 0]}, ValueError, ["torque limit of u_phi", "positive"]),
+    "torque limit NaN": (RACER, {"torque_limits": np.nan}, ValueError, ["torque limit of u_psi", "finite", "nan"]),
+    "torque limits shape": (RACER, {"torque_limits": [1, 2]}, ValueError, ["torque_limits", "u_psi", "[1, 2]"]),
+    "joint limit unknown": (SNAKEBOARD, {"joint_limits": {"psi": 1}}, ValueError, ["'psi'", "known: phi"]),
+    "joint limit negative": (SNAKEBOARD, {"joint_limits": {"phi": -1}}, ValueError, ["joint limit of phi", "positive"]),
+    "joint limit bare": (RACER, {"joint_limits": 1.0}, ValueError, ["joint_limits", "True, False", "1.0"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("env_id", "arguments", "kind", "words"), ARGUMENTS.values(), ids=ARGUMENTS)
+def test_impossible_arguments(env_id, arguments, kind, words):
+    with pytest.raises(kind) as error:
+        gym.make(env_id, **arguments)
+    _message(error, *words)
+
+
+def test_every_kind_of_argument_is_refused_somewhere():
+    """A new argument of the environment needs a case above."""
+    tried = {name for _, arguments, _, _ in ARGUMENTS.values() for name in arguments}
+    named = inspect.signature(LocomotionEnv).parameters
+    tried.discard("ctrl_cost_wieght")
+    assert tried - {"ctrl_cost_weight"} == set(named) - {"render_mode", "weights"}
+
+
+def test_drawing_is_refused():
+    with pytest.raises(ValueError, match="render_mode") as error:
+        LocomotionEnv("snakeboard", render_mode="human")
+    _message(error, "None", "'human'", "do not draw")
+
+
+# -- reset --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def env(env_id, bare):
+    return bare(env_id)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"Q": [0]}, ["'Q'", "known: q, qdot"]),
+        ({"q_dot": [0]}, ["'q_dot'", "mean 'qdot'"]),
+        ({"q": [0.1]}, ["'q'", "(1,)", "x, y, theta"]),
+        ({"q": 0.1}, ["'q'", "()", "x, y, theta"]),
+        ({"qdot": np.zeros((2, 2))}, ["'qdot'", "(2, 2)", "x, y, theta"]),
+    ],
+    ids=["unknown option", "misspelt option", "short q", "scalar q", "matrix qdot"],
+)
+def test_impossible_reset_options(env, options, words):
+    with pytest.raises(ValueError, match="reset option") as error:
+        env.reset(options=options)
+    _message(error, *words)
+
+
+@pytest.mark.parametrize("key", ["q", "qdot"])
+def test_reset_options_must_be_finite(env, key):
+    with pytest.raises(ValueError, match="must be finite") as error:
+        env.reset(options={key: np.full(env.mechanism.n, np.nan)})
+    _message(error, repr(key), "nan")
+
+
+def test_reset_names_both_shapes(env):
+    with pytest.raises(ValueError, match="shape") as error:
+        env.reset(options={"q": np.zeros(2)})
+    _message(error, f"({env.mechanism.n},)", "(2,)")
+
+
+def test_reset_beyond_a_stop(env):
+    """Refused beyond the stop, accepted on it, and beyond it where there is none."""
+    joint, limit = next(iter(env.mechanism.joint_limits.items()))
+    q = np.zeros(env.mechanism.n)
+    q[env.mechanism.coordinates.index(joint)] = -limit
+    env.reset(options={"q": q})
+    q[env.mechanism.coordinates.index(joint)] = -limit - 1e-9
+    with pytest.raises(ValueError, match="beyond its stop") as error:
+        env.reset(options={"q": q})
+    _message(error, joint, str(limit), "joint_limits=False")
+
+
+def test_reset_with_a_velocity_that_slips(env):
+    qdot = np.zeros(env.mechanism.n)
+    qdot[1] = 0.5  # sideways, and every wheel points along x
+    with pytest.raises(MechanismError, match="violates the rolling constraints") as error:
+        env.reset(options={"q": np.zeros(env.mechanism.n), "qdot": qdot})
+    _message(error, "0.5", "nearest feasible velocity")
+
+
+def test_a_refused_reset_leaves_the_episode_as_it_was(env):
+    env.reset(seed=0)
+    before = env.q
+    with pytest.raises(ValueError, match="reset option"):
+        env.reset(options={"q": [0]})
+    assert np.array_equal(env.q, before)
+
+
+# -- step ---------------------------------------------------------------------------------------
+
+
+def test_step_before_reset(env):
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+
+
+@pytest.mark.parametrize("name", ["q", "qdot", "v", "energy"])
+def test_state_before_reset(env, name):
+    with pytest.raises(gym.error.ResetNeeded, match="call reset"):
+        getattr(env, name)
+
+
+def test_nan_action(env):
+    """Refused whichever element it is, and the state stays as it was."""
+    env.reset(seed=0)
+    env.step(np.ones(env.action_space.shape, np.float32))
+    before = env.q
+    for i in range(env.action_space.shape[0]):
+        action = np.zeros(env.action_space.shape, np.float32)
+        action[i] = np.nan
+        with pytest.raises(ValueError, match="not a number") as error:
+            env.step(action)
+        _message(error, "nan", "policy")
+        assert np.array_equal(env.q, before)
+    twin = LocomotionEnv(env.mechanism.name)
+    twin.reset(seed=0)
+    for other in (env, twin):
+        other.step(np.ones(env.action_space.shape, np.float32))
+    twin.step(np.ones(env.action_space.shape, np.float32))
+    assert np.array_equal(env.q, twin.q)  # what was refused is not replayed either
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (3,), (1, 2), (2, 1)])
+def test_action_of_another_shape(env, shape):
+    env.reset(seed=0)
+    for action in (np.zeros(shape, np.float32), np.zeros(shape).tolist()):
+        with pytest.raises(ValueError, match="shape") as error:
+            env.step(action)
+        _message(error, str(env.action_space.shape), str(shape), *env.mechanism.controls)
+
+
+def _equal_actions(m):
+    """One action of m elements in the guises in which it may come."""
+    plain = np.full(m, 0.5, np.float32)
+    frozen = plain.copy()
+    frozen.flags.writeable = False
+    return {
+        "float32": plain,
+        "float64": plain.astype(float),
+        "float16": plain.astype(np.float16),
+        "list": plain.tolist(),
+        "tuple": tuple(plain.tolist()),
+        "list of scalars": list(plain),
+        "non-contiguous": np.full(3 * m, 0.5, np.float32)[::3],
+        "reversed": plain[::-1],
+        "another byte order": plain.astype(">f4"),
+        "read-only": frozen,
+    }
+
+
+@pytest.mark.parametrize("guise", _equal_actions(1))
+def test_an_action_may_come_in_any_guise(env, guise):
+    m = env.action_space.shape[0]
+    results, states = [], []
+    for name in ("float32", guise):
+        env.reset(seed=0)
+        results.append(env.step(_equal_actions(m)[name]))
+        states.append(env.q)
+    assert results[0][0].tobytes() == results[1][0].tobytes()
+    assert results[0][1:] == results[1][1:]
+    assert np.array_equal(*states)
+
+
+def test_whole_numbers_are_an_action(env):
+    m = env.action_space.shape[0]
+    results = []
+    for action in (np.ones(m, np.float32), np.ones(m, int), [1] * m, np.ones(m, bool)):
+        env.reset(seed=0)
+        results.append(env.step(action)[0].tobytes())
+    assert len(set(results)) == 1
+
+
+@pytest.mark.parametrize("stops", [True, False], ids=["stops", "free"])
+def test_divergence_ends_the_episode_with_a_finite_observation(env, stops):
+    """A step that overflows: terminated, flagged, and the last finite state stays."""
+    stormy = LocomotionEnv(env.mechanism, torque_limits=1e308, joint_limits=stops, dt=1e3)
+    calm, _ = stormy.reset(seed=0)
+    one = np.ones(env.action_space.shape, np.float32)
+    for _ in range(20):
+        observation, reward, terminated, truncated, info = stormy.step(one)
+        if terminated:
+            break
+        calm = observation
+    assert terminated
+    assert not truncated
+    assert info["diverged"] is True
+    assert np.array_equal(observation, calm)
+    assert np.isfinite(observation).all()
+    assert np.isfinite(reward)
+    assert np.isfinite(stormy.q).all()
+
+
+DIVERGE_LATE = """
+import sys
+import numpy as np
+from nhenv.env import LocomotionEnv
+
+env = LocomotionEnv(sys.argv[1], torque_limits=1e308, joint_limits=False, dt=1e3)
+env.reset(seed=0)
+nothing = np.zeros(env.action_space.shape, np.float32)
+for _ in range(int(sys.argv[2])):
+    env.step(nothing)
+assert env.step(nothing + 1)[4]["diverged"]
+for _ in range(20000):
+    env.step(nothing)
+assert np.isfinite(env.q).all()
+print("survived")
+"""
+
+
+@pytest.mark.parametrize("steps", [510, 511, 512])
+def test_stepping_on_after_divergence_is_safe_at_any_time(steps, kernel_cache):
+    """Also where the kernel's memory of 512 actions has just filled up: a fault there would write beyond it.
+
+    In a process of its own, because it would be killed.
+    """
+    command = [sys.executable, "-W", "error", "-c", DIVERGE_LATE, "snakeboard", str(steps)]
+    root = Path(__file__).parents[2]
+    result = subprocess.run(command, cwd=root, env=dict(os.environ), capture_output=True, text=True)
+    assert (result.returncode, result.stdout) == (0, "survived\n"), result.stderr
+
+
+def test_ids_of_this_file_are_registered():
+    assert {SNAKEBOARD, RACER} <= set(nhenv.environment_ids())
