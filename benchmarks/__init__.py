@@ -1,0 +1,1 @@
+"""Measurements of speed and accuracy; each prints a table and the command that made it."""
