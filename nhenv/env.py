@@ -23,6 +23,7 @@ from nhenv.scene import BAD_ACTION, HISTORY_FULL, Scene
 __all__ = ["LocomotionEnv"]
 
 Array = NDArray[np.float64]
+Response = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]
 
 
 class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -166,15 +167,13 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._bind()
         return self._observation(), {}
 
-    def step(self, action: NDArray[Any]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[Any]) -> Response:
         """Hold the torques `action * torque_limits` for `dt` seconds."""
         try:
-            observation, status, reward, info = self._respond(self._memory, action)
+            response = self._respond(self._memory, action)
         except (AttributeError, TypeError, ValueError):  # not an array of m numbers: say so, or make it one
-            observation, status, reward, info = self._respond(self._memory, self._as_action(action))
-        if status:
-            return self._exception(status, action, observation, reward, info)
-        return observation, reward, False, False, info
+            response = self._respond(self._memory, self._as_action(action))
+        return self._exception(response, action) if response[2] else response
 
     # -- state ---------------------------------------------------------------------------------
 
@@ -259,10 +258,9 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(f"action must have shape {shape} ({controls}), got shape {array.shape}") from None
         return array
 
-    def _exception(
-        self, status: float, action: Any, observation: NDArray[np.float32], reward: float, info: dict[str, Any]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def _exception(self, response: Response, action: Any) -> Response:
         """Deal with what happens rarely."""
+        observation, reward, status, _, info = response
         if status == BAD_ACTION:
             raise ValueError(
                 f"action {np.asarray(action).tolist()} is not a number; a policy that returns NaN has usually diverged"
@@ -343,7 +341,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 )
 
 
-def _refuse(memory: Array, action: Any) -> tuple[Any, float, float, dict[str, Any]]:
+def _refuse(memory: Array, action: Any) -> Response:
     raise ResetNeeded("step() was called before reset(); call reset() to start an episode")
 
 

@@ -159,9 +159,10 @@ class _Generator:
         return "".join(f"{name} = {value!r}\n" for name, value in tables.items())
 
     def _respond(self) -> str:
-        """Plain Python around `step`: (memory, action) -> (observation, status, reward, info), all fresh.
+        """Plain Python around `step`: (memory, action) -> what an environment's step returns, all fresh.
 
-        Unpacking by name costs half of what `*action` does, and a literal a third of `dict(zip(...))`.
+        The place of `terminated` has the status if that is not RUNNING. Unpacking by name costs half of
+        what `*action` does, and a literal a third of `dict(zip(...))`.
         """
         actions = ", ".join(action.name for action in self.actions)
         entries = ", ".join(f"{_label(name)!r}: result[{i + 2}]" for i, name in enumerate(self.judgement))
@@ -169,7 +170,7 @@ class _Generator:
             f"{actions}, = action.tolist()",
             f"observation = empty({len(self.observation)}, FLOAT32)",
             f"result = step(memory, observation, {actions})",
-            f"return observation, result[0], result[1], {{{entries}}}",
+            f"return observation, result[1], result[0] or False, False, {{{entries}}}",
         ]
         text = textwrap.indent("\n".join(lines), "    ")
         return (
@@ -221,10 +222,9 @@ class _Generator:
             f"{old}= {state},",
             f"dt = memory[{place['dt']}]",
             f"k = memory[{self.memory['k'][0]}:{self.memory['k'][1]}]",
-            f"{new}= advance_states(dt, {old}{held}k)",
         ]
-        if self.joints:
-            lines += self._through_impacts(old, new, controls)
+        flight = f"{new}= advance_states(dt, {old}{held}k)"
+        lines += self._through_impacts(old, new, controls, flight) if self.joints else [flight]
         lines += [
             f"status = {RUNNING}",
             f"if not isfinite({' + '.join(f'0.0*{name}__new' for name in states)}):",
@@ -247,23 +247,26 @@ class _Generator:
         arguments = ", ".join(("memory", "observation", *(a.name for a in self.actions)))
         return f"{decorator}def step({arguments}):\n" + textwrap.indent("\n".join(lines), "    ") + "\n"
 
-    def _through_impacts(self, old: str, new: str, controls: list[str]) -> list[str]:
-        """Accept the step if no joint can have met its stop, else repeat it with care."""
+    def _through_impacts(self, old: str, new: str, controls: list[str], flight: str) -> list[str]:
+        """Accept free flight if no joint can have met its stop, else integrate from impact to impact."""
         place = {name: start for name, (start, _) in self.memory.items()}
-        safe = []
+        away, safe = [], []
         for j, (angle, rate) in enumerate(self.joints):
             stop = f"memory[{place['stop'] + j}]"
             excursion = f"fabs({angle}__old) + dt*fabs(joint_rates({old}k)[{j}]) < {stop}"
-            safe += [
-                f"fabs({angle}__old) < {stop}",
-                f"fabs({angle}__new) < {stop}",
-                f"({rate}__old*{rate}__new >= 0.0 or {excursion})",
-            ]
+            away.append(f"fabs({angle}__old) < {stop}")
+            safe += [f"fabs({angle}__new) < {stop}", f"({rate}__old*{rate}__new >= 0.0 or {excursion})"]
         parts = ("state", "control", "k", "stop", "free", "work", "hits", "new")
         arrays = ", ".join(f"memory[{start}:{end}]" for start, end in (self.memory[part] for part in parts))
         n = len(self.flow.states)
         return [
-            f"if not ({' and '.join(safe)}):",
+            f"if {' and '.join(away)}:",
+            f"    {flight}",
+            f"    accepted = {' and '.join(safe)}",
+            "else:",
+            f"    {new}= {old}",
+            "    accepted = False",
+            "if not accepted:",
             f"    {_items('memory', len(controls), place['control'])}, = {', '.join(controls)},",
             f"    {_items('memory', n, place['new'])}, = {new}",
             f"    hold(dt, {arrays})",

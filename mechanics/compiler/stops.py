@@ -42,7 +42,8 @@ def hold(
 ) -> int:
     """Advance `state` in place by `h` seconds with the controls held, through every impact.
 
-    On entry `new` holds the state after `h` seconds without stops. Returns the number of impacts.
+    On entry `new` holds the state after `h` seconds without stops, unless a joint is at its stop.
+    Returns the number of impacts.
     """
     left, known, impacts = h, True, 0
     for _ in range(MAX_EVENTS):
@@ -144,14 +145,24 @@ def zero(
     place, slope = (RATES[j], len(ANGLES) + j) if turning else (ANGLES[j], j)
     low, high = 0.0, end
     below, above = sign * state[place] - level, sign * new[place] - level
-    # Start from the parabola through both ends, which a joint under a held torque follows closely.
+    # Start from the cubic through both ends and their slopes, which a held torque makes nearly exact.
+    motion(new, control, k, work)
+    rate_above = sign * work[slope]
     motion(state, control, k, work)
     rate = sign * work[slope]
-    curvature = (above - below - rate * end) / (end * end)
-    discriminant = rate * rate - 4.0 * curvature * below
+    chord = (above - below) / end
+    bend = (3.0 * chord - 2.0 * rate - rate_above) / end
+    twist = (rate + rate_above - 2.0 * chord) / (end * end)
+    # The parabola without the twist has the root below; from there, Newton on the cubic.
+    discriminant = rate * rate - 4.0 * bend * below
     time = 0.5 * end
     if below < 0.0 and discriminant > 0.0 and rate + sqrt(discriminant) > 0.0:
         time = min(-2.0 * below / (rate + sqrt(discriminant)), end)
+    for _ in range(3):
+        cubic = below + time * (rate + time * (bend + time * twist))
+        cubic_rate = rate + time * (2.0 * bend + time * 3.0 * twist)
+        if cubic_rate > 0.0 and 0.0 < time - cubic / cubic_rate < end:
+            time -= cubic / cubic_rate
     for _ in range(MAX_ITERATIONS):
         advance(time, state, control, free, k, new)
         motion(new, control, k, work)
