@@ -67,7 +67,7 @@ def main(arguments: Arguments) -> None:
         contender.run(arguments.steps)  # warm-up: compilation and caches
     rounds = track(range(arguments.rounds), "rounds", console=Console(stderr=True))
     times = np.array([[contender.run(arguments.steps) for contender in contenders] for _ in rounds])
-    table = Table("environment", "µs a step (quartiles)", f"times faster than {REFERENCE} (quartiles)")
+    table = Table("environment", "µs a step", f"times {REFERENCE}", caption="medians and quartiles")
     for name, column in zip(names, times.T, strict=True):
         low, middle, high = np.percentile(column * 1e6, [25, 50, 75])
         ratio = np.percentile(times[:, 0] / column, [25, 50, 75])

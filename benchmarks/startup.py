@@ -46,7 +46,7 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Print seconds to the first step."""
-    table = Table("environment", "cache", "seconds to the first step (quartiles)")
+    table = Table("environment", "cache", "seconds", caption="to the first step: medians and quartiles")
     jobs: list[tuple[str, str, int]] = [
         (env_id, cache, getattr(arguments, cache)) for env_id in nhenv.environment_ids() for cache in ("cold", "warm")
     ]
