@@ -1,5 +1,6 @@
 """What the generator makes of a mechanism and a task: what is left out, and that names do not matter."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -118,3 +119,22 @@ def test_names_do_not_matter(actions):
 
 def test_ids_are_camel_case_of_their_mechanisms():
     assert nhenv.environment_ids() == ("nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0")
+
+
+@pytest.mark.parametrize("name", mechanics.names())
+def test_backends_agree_through_impacts(name):
+    """The NumPy row interprets the text that the Numba row compiles, stops included."""
+    env, rng = LocomotionEnv(name), np.random.default_rng(1)
+    env.reset(seed=0)
+    scenes = [dataclasses.replace(env._scene, backend=backend) for backend in ("numba", "numpy")]
+    memories = [env._memory.copy() for _ in scenes]
+    impacts = 0
+    for _ in range(100):
+        action = rng.uniform(-1, 1, env.action_space.shape)
+        one, other = (s.kernel.respond(m, action) for s, m in zip(scenes, memories, strict=True))
+        # Compiled code contracts products and sums; a hundred holds and a dozen impacts amplify that rounding.
+        assert memories[1] == pytest.approx(memories[0], rel=1e-9, abs=1e-9)
+        assert other[0] == pytest.approx(one[0], rel=1e-6, abs=1e-6)  # float32
+        assert other[1] == pytest.approx(one[1], rel=1e-9, abs=1e-9)
+        impacts += abs(scenes[0].values(memories[0])[env.mechanism.coordinates[-1]]) == 1.2
+    assert impacts > 3  # the last coordinate of both is the joint with stops
