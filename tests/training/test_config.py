@@ -1,0 +1,111 @@
+import dataclasses
+import json
+import os
+
+import pytest
+
+import nhenv
+from nhenv import tasks
+from training.config import (
+    CONFIGS,
+    EVALUATION_SEEDS,
+    SEEDS_PER_RUN,
+    TUNING_SEEDS,
+    EvaluationConfig,
+    GaitConfig,
+    PPOConfig,
+    check_env_id,
+    for_env,
+    quick,
+    training_seed,
+)
+from training.gaits import gait_path
+from training.store import digest, piece_path, read_json, settings, write_bytes, write_json
+from training.train import ppo_path
+
+SNAKEBOARD = "nhenv/SnakeboardForward-v0"
+
+
+def changed(value):
+    """Something else of the same kind."""
+    if isinstance(value, bool):
+        return not value
+    return (*value[:-1], value[-1] + 1) if isinstance(value, tuple) else value + 1
+
+
+def test_settings_are_for_tasks_that_exist():
+    assert set(CONFIGS) <= {task.name for task in tasks.TASKS}
+    assert all(for_env(env_id) for env_id in nhenv.environment_ids())
+
+
+def test_misspelt_id_is_answered_with_the_right_one():
+    with pytest.raises(ValueError, match="Did you mean 'nhenv/SnakeboardForward-v0'"):
+        check_env_id("nhenv/SnakebordForward-v0")
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PPOConfig)])
+def test_path_of_a_run_depends_on_every_setting(tmp_path, name):
+    config = PPOConfig()
+    other = dataclasses.replace(config, **{name: changed(getattr(config, name))})
+    assert ppo_path(SNAKEBOARD, config, 0, tmp_path) != ppo_path(SNAKEBOARD, other, 0, tmp_path)
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(GaitConfig)])
+def test_path_of_a_gait_depends_on_every_setting(tmp_path, name):
+    config = GaitConfig()
+    other = dataclasses.replace(config, **{name: changed(getattr(config, name))})
+    assert gait_path(SNAKEBOARD, config, tmp_path) != gait_path(SNAKEBOARD, other, tmp_path)
+
+
+def test_path_depends_on_seed_environment_and_code(tmp_path):
+    config = PPOConfig()
+    other_id = next(env_id for env_id in nhenv.environment_ids() if env_id != SNAKEBOARD)
+    paths = {
+        ppo_path(SNAKEBOARD, config, 0, tmp_path).name,
+        ppo_path(SNAKEBOARD, config, 1, tmp_path).name.replace("seed1", "seed0"),
+        ppo_path(other_id, config, 0, tmp_path).name,
+    }
+    assert len(paths) == 3
+    assert digest(settings(SNAKEBOARD, "a")) != digest(settings(SNAKEBOARD, "b"))
+    assert piece_path(tmp_path, settings(SNAKEBOARD, "a"), "x").parent == tmp_path / "SnakeboardForward-v0"
+
+
+def test_seeds_of_training_tuning_and_evaluation_never_meet():
+    last_run = TUNING_SEEDS // SEEDS_PER_RUN - 1
+    for config in CONFIGS.values():
+        assert config.ppo.n_envs <= SEEDS_PER_RUN
+        assert training_seed(last_run) + config.ppo.n_envs <= TUNING_SEEDS
+        assert (
+            TUNING_SEEDS + max([config.ppo.curve_episodes, *(gait.starts for gait in config.gaits.values())])
+            <= EVALUATION_SEEDS
+        )
+    for run in (-1, last_run + 1):
+        with pytest.raises(ValueError, match="seed of a run"):
+            training_seed(run)
+
+
+def test_quick_is_shorter():
+    config = for_env(SNAKEBOARD)
+    short = quick(config)
+    assert short.ppo.timesteps < config.ppo.timesteps
+    assert all(short.gaits[name].generations < gait.generations for name, gait in config.gaits.items())
+    assert isinstance(short.evaluation, EvaluationConfig)
+
+
+def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "folder" / "file"
+    write_bytes(path, b"before")
+
+    def broken(*arguments):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", broken)
+    with pytest.raises(OSError, match="disk full"):
+        write_bytes(path, b"after")
+    assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [("file", b"before")]
+
+
+def test_json_has_no_nan(tmp_path):
+    write_json(tmp_path / "file.json", {"a": [float("nan"), 1.5, {"b": float("inf")}], "c": ("x", None)})
+    assert read_json(tmp_path / "file.json") == {"a": [None, 1.5, {"b": None}], "c": ["x", None]}
+    json.loads((tmp_path / "file.json").read_text(), parse_constant=pytest.fail)

@@ -1,0 +1,118 @@
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from training.config import PPOConfig
+from training.evaluate import load_policy
+from training.progress import Interrupted
+from training.store import read_json
+from training.train import Linear, make_model, make_vec_env, ppo_path, train_piece
+
+SNAKEBOARD = "nhenv/SnakeboardForward-v0"
+TINY = PPOConfig(
+    timesteps=1280, n_envs=4, n_steps=32, batch_size=64, n_epochs=2, curve_every=2, curve_episodes=1, checkpoint_every=3
+)
+
+
+def parameters(out, seed=0):
+    policy = load_policy(ppo_path(SNAKEBOARD, TINY, seed, out).with_suffix(".zip")).model
+    return torch.cat([value.flatten() for value in policy.policy.parameters()]).detach().numpy()
+
+
+def curve(out):
+    points = read_json(ppo_path(SNAKEBOARD, TINY, 0, out))["result"]["curve"]
+    return [{name: value for name, value in point.items() if name != "cpu_s"} for point in points]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    out = tmp_path_factory.mktemp("uninterrupted")
+    train_piece(SNAKEBOARD, TINY, 0, out)
+    return out
+
+
+# Interrupted saves before it ends; a process that dies leaves the last checkpoint, of three updates.
+@pytest.mark.parametrize("end", [Interrupted, MemoryError])
+@pytest.mark.parametrize("updates", [2, 5])
+def test_interrupted_run_ends_as_if_it_had_not_been(tmp_path, uninterrupted, end, updates):
+    heard = []
+
+    def interrupt(done, total, text):
+        heard.append(done)
+        if done == updates * 128:
+            raise end
+
+    def listen(done, total, text):
+        heard.append(done)
+
+    with pytest.raises(end):
+        train_piece(SNAKEBOARD, TINY, 0, tmp_path, interrupt)
+    path = ppo_path(SNAKEBOARD, TINY, 0, tmp_path)
+    assert not path.exists()
+    heard.clear()
+    np.random.seed(1)  # noqa: NPY002 (a fresh process has other random states)
+    torch.manual_seed(1)
+    train_piece(SNAKEBOARD, TINY, 0, tmp_path, listen)
+    assert heard[0] == 128 * (updates if end is Interrupted else updates - updates % 3)
+    np.testing.assert_array_equal(parameters(tmp_path), parameters(uninterrupted))
+    assert curve(tmp_path) == curve(uninterrupted)
+    assert not path.with_suffix(".checkpoint").exists()
+
+
+def test_finished_run_is_not_done_again(uninterrupted):
+    before = {path: os.stat(path).st_mtime_ns for path in uninterrupted.rglob("*")}
+    train_piece(SNAKEBOARD, TINY, 0, uninterrupted, lambda *message: pytest.fail("it trains again"))
+    assert {path: os.stat(path).st_mtime_ns for path in uninterrupted.rglob("*")} == before
+
+
+def test_history_says_how_the_policy_came_about(uninterrupted):
+    written = read_json(ppo_path(SNAKEBOARD, TINY, 0, uninterrupted))
+    assert written["settings"]["ppo"] == {
+        name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(TINY).items()
+    }
+    assert written["settings"]["seed"] == 0
+    assert written["result"]["steps"] == TINY.timesteps
+    assert [point["steps"] for point in written["result"]["curve"]] == [0, 256, 512, 768, 1024, 1280]
+    assert written["result"]["versions"].keys() >= {"torch", "stable_baselines3", "numpy"}
+
+
+def test_settings_reach_the_algorithm():
+    # None of these is a default of Stable-Baselines3.
+    config = PPOConfig(
+        n_envs=2, n_steps=8, batch_size=4, n_epochs=3, learning_rate=(4e-3, 2e-3), gamma=0.9, gae_lambda=0.8,
+        clip_range=0.3, target_kl=0.07, log_std=-0.5, hidden=(16, 8),
+    )  # fmt: skip
+    model = make_model(SNAKEBOARD, config, 3)
+    assert model.seed == 3000
+    assert (model.n_envs, model.n_steps, model.batch_size, model.n_epochs) == (2, 8, 4, 3)
+    assert (model.gamma, model.gae_lambda, model.clip_range(1.0), model.target_kl) == (0.9, 0.8, 0.3, 0.07)
+    assert model.ent_coef == 0
+    assert [model.lr_schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([4e-3, 3e-3, 2e-3])
+    assert model.policy.log_std.tolist() == [-0.5, -0.5]
+    for net in (model.policy.mlp_extractor.policy_net, model.policy.mlp_extractor.value_net):
+        assert [type(layer) for layer in net] == [torch.nn.Linear, torch.nn.Tanh] * 2
+        assert [layer.out_features for layer in net[::2]] == [16, 8]
+
+
+def test_linear_schedule():
+    assert [Linear(4.0, 2.0)(remaining) for remaining in (1, 0.5, 0)] == [4.0, 3.0, 2.0]
+
+
+def test_first_episodes_end_out_of_phase_and_later_ones_do_not():
+    count = 5
+    envs = make_vec_env(SNAKEBOARD, count)
+    envs.seed(0)
+    envs.reset()
+    ends = [[] for _ in range(count)]
+    for step in range(1, 601):
+        _, _, dones, infos = envs.step(np.zeros((count, 2), np.float32))
+        for i in np.flatnonzero(dones):
+            assert infos[i]["TimeLimit.truncated"]
+            ends[i].append(step)
+    first = [times[0] for times in ends]
+    assert len(set(first)) == count
+    assert all(1 <= time <= 300 for time in first)
+    assert all(times[1] - times[0] == 300 for times in ends)

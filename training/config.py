@@ -1,0 +1,171 @@
+"""Every setting of an experiment, as frozen data: one `TaskConfig` for each task."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+import nhenv
+from mechanics.expressions import unknown_name
+
+__all__ = [
+    "CONFIGS",
+    "EVALUATION_SEEDS",
+    "SEEDS_PER_RUN",
+    "TUNING_SEEDS",
+    "EvaluationConfig",
+    "GaitConfig",
+    "PPOConfig",
+    "TaskConfig",
+    "check_env_id",
+    "for_env",
+    "quick",
+    "task_name",
+    "training_seed",
+]
+
+# Three ranges of environment seeds that never meet: nobody is judged on starts that it was fitted to.
+SEEDS_PER_RUN = 1_000  # run s trains on the seeds from s * SEEDS_PER_RUN
+TUNING_SEEDS = 10_000_000  # where gaits are tuned and learning curves are drawn
+EVALUATION_SEEDS = 20_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaitConfig:
+    """Tuning of a sinusoidal gait by differential evolution.
+
+    Attributes:
+        steered: whether amplitudes and frequency change over the episode, and the heading is fed back.
+        cyclic_ratio: frequency of the joints without stops over that of the joints with stops.
+        frequency: smallest and largest angular frequency of the joints with stops, rad/s.
+        cyclic_amplitude: largest amplitude of a joint without stops, rad. One with stops reaches its stop.
+        steering: largest gain from the sine of the heading to the joints with stops, rad.
+        damping: smallest and largest kd of the feedback, 1/s. A torque held for dt needs kd * dt < 2.
+        population: candidates in a generation, rounded down to a multiple of the number of parameters.
+        generations: generations after the first, which is a Latin hypercube.
+        starts: episodes on which each candidate is tried.
+        seed: seed of the search.
+    """
+
+    steered: bool = False
+    cyclic_ratio: float = 1.0
+    frequency: tuple[float, float] = (1.0, 30.0)
+    cyclic_amplitude: float = 12.0
+    steering: float = 2.0
+    damping: tuple[float, float] = (2.0, 38.0)
+    population: int = 64
+    generations: int = 100
+    starts: int = 4
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig:
+    """PPO with Stable-Baselines3.
+
+    Attributes:
+        timesteps: environment steps of a run, over all environments.
+        n_envs: environments side by side.
+        n_steps: steps of each environment between updates. The number of updates counts, not of steps.
+        batch_size: transitions in a minibatch.
+        n_epochs: passes over a rollout.
+        learning_rate: at the beginning and at the end, linear in between. 1e-3 to begin with costs metres.
+        gamma: discount of a step.
+        gae_lambda: λ of the generalized advantage estimate.
+        clip_range: clip of the probability ratio.
+        target_kl: an update stops early above 1.5 times this divergence.
+        log_std: initial logarithm of the policy's standard deviation, in actions.
+        hidden: units of each tanh layer; policy and value function share none.
+        curve_every: updates between two points of the learning curve.
+        curve_episodes: episodes of the deterministic policy behind each point.
+        checkpoint_every: updates between two checkpoints.
+    """
+
+    timesteps: int = 3_000_000
+    n_envs: int = 64
+    n_steps: int = 64
+    batch_size: int = 1024
+    n_epochs: int = 10
+    learning_rate: tuple[float, float] = (3e-3, 3e-4)
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    target_kl: float = 0.03
+    log_std: float = 0.0
+    hidden: tuple[int, ...] = (64, 64)
+    curve_every: int = 10
+    curve_episodes: int = 8
+    checkpoint_every: int = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """How a finished controller is judged.
+
+    Attributes:
+        episodes: episodes, the same starts for every controller.
+        fine_substeps: steps of the integrator in a hold for a second opinion, so that none wins on its error.
+    """
+
+    episodes: int = 100
+    fine_substeps: int = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """Settings of every part of an experiment on one task.
+
+    Attributes:
+        gaits: by name, with equal budgets. The first is the one that is drawn beside the policy.
+        ppo: what trains the policy.
+        evaluation: what judges both.
+    """
+
+    gaits: dict[str, GaitConfig] = field(
+        default_factory=lambda: {"sinusoid": GaitConfig(), "steered sinusoid": GaitConfig(steered=True)}
+    )
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+CONFIGS: dict[str, TaskConfig] = {"Forward": TaskConfig()}
+
+
+def quick(config: TaskConfig) -> TaskConfig:
+    """The same experiment, far too short: it shows that everything runs."""
+    return dataclasses.replace(
+        config,
+        gaits={name: dataclasses.replace(gait, population=16, generations=5) for name, gait in config.gaits.items()},
+        ppo=dataclasses.replace(config.ppo, timesteps=50_000, curve_every=2),
+        evaluation=dataclasses.replace(config.evaluation, episodes=8),
+    )
+
+
+def check_env_id(env_id: str) -> str:
+    """Return `env_id` if there are settings for it; raise ValueError with the nearest known id otherwise."""
+    known = [name for name in nhenv.environment_ids() if task_name(name) in CONFIGS]
+    if env_id not in known:
+        raise ValueError(unknown_name("environment", env_id, known))
+    return env_id
+
+
+def for_env(env_id: str) -> TaskConfig:
+    """Settings for the task of this environment."""
+    return CONFIGS[task_name(check_env_id(env_id))]
+
+
+def training_seed(run: int) -> int:
+    """First of the environment seeds on which run `run` trains."""
+    runs = TUNING_SEEDS // SEEDS_PER_RUN
+    if not 0 <= run < runs:
+        raise ValueError(f"the seed of a run must be from 0 to {runs - 1}, got {run}: larger ones are kept for judging")
+    return run * SEEDS_PER_RUN
+
+
+def task_name(env_id: str) -> str:
+    """Name of the task of a registered environment."""
+    kwargs: dict[str, Any] = gym.spec(env_id).kwargs
+    return kwargs["task"]

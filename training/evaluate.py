@@ -1,0 +1,234 @@
+"""Run a controller, gait or policy, in one and the same way, and measure what it did.
+
+python -m training.evaluate runs/compare/SnakeboardForward-v0/ppo-seed0-0123456789ab.zip
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from mechanics.expressions import evaluate as value_of
+from mechanics.mechanism import Mechanism
+from nhenv.env import LocomotionEnv
+from training.config import EVALUATION_SEEDS, EvaluationConfig, check_env_id
+from training.store import read_json
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
+__all__ = [
+    "METRICS",
+    "Controller",
+    "PolicyController",
+    "Rollout",
+    "evaluate",
+    "joint_index",
+    "load_policy",
+    "locomotion",
+    "make_envs",
+    "measure",
+    "rollout",
+    "summary",
+]
+
+Array = NDArray[np.float64]
+Env = gym.Env[NDArray[np.float32], NDArray[np.float32]]
+
+METRICS = ("distance_m", "energy_j", "cost_of_transport", "return")
+GRAVITY = 9.81  # m/s²; only the cost of transport uses it
+
+
+class Controller(Protocol):
+    """What the harness drives: it is shown observations and nothing else."""
+
+    def reset(self, episodes: int) -> None:
+        """Begin `episodes` episodes, which run in lockstep."""
+
+    def __call__(self, observations: NDArray[np.float32], /) -> NDArray[np.float32]:
+        """Actions (N, m) for observations (N, d)."""
+
+
+class PolicyController:
+    """The mean action of a policy of Stable-Baselines3."""
+
+    def __init__(self, model: PPO) -> None:
+        self.model = model
+
+    def reset(self, episodes: int) -> None:
+        """Nothing to do: the policy has no memory."""
+
+    def __call__(self, observations: NDArray[np.float32], /) -> NDArray[np.float32]:
+        """Actions (N, m) for observations (N, d)."""
+        return self.model.predict(observations, deterministic=True)[0]
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """N episodes of T steps.
+
+    Attributes:
+        returns: sums of rewards, shape (N,).
+        q: coordinates before each step and after the last, shape (N, T + 1, n).
+        torques: torques that were held, in N m, shape (N, T, m).
+    """
+
+    returns: Array
+    q: Array
+    torques: Array
+
+
+def make_envs(env_id: str, count: int, **options: Any) -> list[Env]:
+    """Environments to run in lockstep."""
+    return [gym.make(check_env_id(env_id), **options) for _ in range(count)]
+
+
+def locomotion(env: Env) -> LocomotionEnv:
+    """The environment inside its wrappers."""
+    inner = env.unwrapped
+    assert isinstance(inner, LocomotionEnv)
+    return inner
+
+
+def rollout(controller: Controller, envs: Sequence[Env], seeds: Sequence[int], *, record: bool = True) -> Rollout:
+    """Run one episode in each environment.
+
+    Args:
+        controller: what drives them.
+        envs: N environments.
+        seeds: N seeds of their resets.
+        record: whether to keep q and torques; without them (T = 0) it is several times faster.
+    """
+    inner = [locomotion(env) for env in envs]
+    limits = np.array([env.torque_limits for env in inner])
+    controller.reset(len(envs))
+    observations = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
+    returns = np.zeros(len(envs))
+    q = [[env.q for env in inner]]
+    torques = [np.empty((len(envs), 0, len(limits[0])))]
+    alive = [True] * len(envs)
+    while any(alive):
+        actions = controller(observations)
+        for i in (i for i, running in enumerate(alive) if running):
+            observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
+            if info.get("diverged"):
+                raise FloatingPointError(f"the episode with seed {seeds[i]} diverged after actions {actions[i]}")
+            returns[i] += float(reward)
+            alive[i] = not (terminated or truncated)
+        if record:
+            q.append([env.q for env in inner])
+            torques.append((np.clip(actions, -1, 1) * limits)[:, None])
+    return Rollout(returns, np.swapaxes(q, 0, 1), np.concatenate(torques, axis=1))
+
+
+def joint_index(mechanism: Mechanism) -> NDArray[np.intp]:
+    """Coordinate that each control turns, shape (m,); ValueError if a control is not the torque on one joint."""
+    for name, row in mechanism.forces.items():
+        if sorted(row) != ["0"] * (mechanism.n - 1) + ["1"]:
+            raise ValueError(f"{mechanism.name}: {name} is not the torque on one joint, it is the covector {row}")
+    return np.array([row.index("1") for row in mechanism.forces.values()])
+
+
+def measure(env: LocomotionEnv, episodes: Rollout) -> dict[str, Array]:
+    """Numbers (N,) of each episode.
+
+    distance_m is along the mechanism's forward direction; energy_j is ∫ Σ_a |u_a q̇_a| dt, so that no
+    motor gives energy back (exact over a hold, unless the joint turns round in it); cost_of_transport is
+    the energy over weight times distance.
+    """
+    mechanism = env.mechanism
+    forward = np.sign(value_of(mechanism.forward, env.params))
+    x = mechanism.coordinates.index(mechanism.fibre[0])
+    distance = forward * (episodes.q[:, -1, x] - episodes.q[:, 0, x])
+    turned = np.diff(episodes.q[:, :, joint_index(mechanism)], axis=1)
+    energy = np.abs(episodes.torques * turned).sum(axis=(1, 2))
+    at_origin = env.params | dict.fromkeys(mechanism.coordinates, 0.0)
+    weight = GRAVITY * mechanism.numeric(mechanism.inertia, at_origin)[x, x]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cost = energy / (weight * distance)
+    return dict(zip(METRICS, (distance, energy, cost, episodes.returns), strict=True))
+
+
+def evaluate(
+    controller: Controller, env_id: str, config: EvaluationConfig, **options: Any
+) -> tuple[Rollout, dict[str, Array]]:
+    """Episodes of a controller from the starts that are kept for judging, and the numbers of each."""
+    envs = make_envs(env_id, config.episodes, **options)
+    episodes = rollout(controller, envs, range(EVALUATION_SEEDS, EVALUATION_SEEDS + config.episodes))
+    return episodes, measure(locomotion(envs[0]), episodes)
+
+
+def summary(values: Array) -> dict[str, float]:
+    """Mean, standard deviation and extremes."""
+    return {
+        "mean": float(np.mean(values)),
+        "std": float(np.std(values)),
+        "min": float(np.min(values)),
+        "max": float(np.max(values)),
+    }
+
+
+def load_policy(path: Path) -> PolicyController:
+    """Policy of a zip file of Stable-Baselines3. Loading unpickles: only load what you trust."""
+    from stable_baselines3 import PPO
+
+    return PolicyController(PPO.load(path, device="cpu"))
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Judge a trained policy.
+
+    Loading a policy unpickles it, which can run any code: only load files that you trust.
+
+    Attributes:
+        policy: zip file written by `training.train`.
+        env_id: environment; None for the one in the JSON file beside the policy.
+        episodes: number of episodes.
+        substeps: steps of the integrator in a hold; None for the environment's default.
+    """
+
+    policy: tyro.conf.Positional[Path]
+    env_id: str | None = None
+    episodes: int = 100
+    substeps: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.policy.is_file():
+            raise ValueError(f"there is no policy {self.policy}; training.train and training.compare write them")
+        self.environment()
+
+    def environment(self) -> str:
+        """Id of the environment, as given or as written beside the policy."""
+        if self.env_id is not None:
+            return check_env_id(self.env_id)
+        beside = self.policy.with_suffix(".json")
+        if not beside.is_file():
+            raise ValueError(f"give --env-id: there is no {beside} that names the environment")
+        return check_env_id(str(read_json(beside)["settings"]["env_id"]))
+
+
+def main(options: Evaluate) -> None:
+    """Print a table of what the policy does."""
+    config = EvaluationConfig(episodes=options.episodes)
+    env_id = options.environment()
+    _, numbers = evaluate(load_policy(options.policy), env_id, config, substeps=options.substeps)
+    table = Table(title=f"{env_id}: {options.episodes} episodes")
+    for heading in ("", "mean", "std", "min", "max"):
+        table.add_column(heading, justify="right")
+    for name, values in numbers.items():
+        table.add_row(name, *(f"{value:.4g}" for value in summary(values).values()))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Evaluate, prog="python -m training.evaluate"))

@@ -1,0 +1,158 @@
+"""The figure of a comparison: where the mechanism went, what its joints did, and how learning went."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from nhenv.env import LocomotionEnv
+from training.evaluate import Rollout, joint_index
+from training.store import write_bytes
+
+__all__ = ["Shown", "draw"]
+
+# Okabe and Ito's colours, which the colour-blind tell apart; line styles repeat what colours say.
+GAITS, POLICY = ("#0072B2", "#56B4E9"), "#D55E00"
+JOINTS = ("#000000", "#009E73", "#CC79A7", "#E69F00")
+STYLES = ("-", "--", "-.", ":")
+GREEK = ("theta", "psi", "phi")
+WINDOW = 4.0  # s, the last ones of the episode
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is drawn of one controller.
+
+    Attributes:
+        label: its name.
+        color: its colour.
+        episodes: recorded episodes, of which the first is drawn.
+    """
+
+    label: str
+    color: str
+    episodes: Rollout
+
+
+def draw(
+    path: Path,
+    title: str,
+    env: LocomotionEnv,
+    shown: Sequence[Shown],
+    curves: Mapping[str, Sequence[Mapping[str, Any]]],
+    reached: Mapping[str, float],
+) -> None:
+    """Write the figure as PNG, legible at 900 pixels.
+
+    Args:
+        path: file.
+        title: heading.
+        env: environment of the episodes.
+        shown: controllers; the joints of the first and the last are drawn side by side.
+        curves: label -> learning curve of a seed.
+        reached: gait -> its distance in m.
+    """
+    height = _height_of_paths(env, shown)
+    figure = Figure(figsize=(9, 7.7 + height), dpi=150, layout="constrained")
+    figure.suptitle(title, fontweight="bold")
+    axes = figure.subplot_mosaic(
+        [["path", "path"], ["curve", "curve"], ["angle0", "angle1"], ["torque0", "torque1"]],
+        height_ratios=[height, 2.3, 1.8, 1.8],
+    )
+    _paths(axes["path"], env, shown)
+    _curves(axes["curve"], curves, reached)
+    for i, one in enumerate((shown[0], shown[-1])):
+        _angles(axes[f"angle{i}"], env, one)
+        _torques(axes[f"torque{i}"], env, one)
+    for name in ("angle", "torque"):
+        pair = [axes[f"{name}{i}"] for i in range(2)]
+        low, high = zip(*(ax.get_ylim() for ax in pair), strict=True)
+        for ax in pair:
+            ax.set_ylim(min(low), max(high))
+    for ax in axes.values():
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(alpha=0.3)
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    write_bytes(path, content.getvalue())
+
+
+def _height_of_paths(env: LocomotionEnv, shown: Sequence[Shown]) -> float:
+    """Height in inches at which the paths fill the width of the figure, and a line of legend fits."""
+    x, y, _ = (env.mechanism.coordinates.index(name) for name in env.mechanism.fibre)
+    wide, high = (np.ptp([one.episodes.q[0][:, i] for one in shown]) for i in (x, y))
+    return float(np.clip(9 * high / max(wide, 1e-9), 0.5, 3.5)) + 0.5
+
+
+def _paths(ax: Axes, env: LocomotionEnv, shown: Sequence[Shown]) -> None:
+    x, y, _ = (env.mechanism.coordinates.index(name) for name in env.mechanism.fibre)
+    for one in shown:
+        q = one.episodes.q[0]
+        ax.plot(q[:, x], q[:, y], color=one.color, label=one.label, lw=1.2)
+        ax.plot(*q[-1, [x, y]], "o", color=one.color, ms=5)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=len(shown), frameon=False)
+
+
+def _curves(ax: Axes, curves: Mapping[str, Sequence[Mapping[str, Any]]], reached: Mapping[str, float]) -> None:
+    for (label, distance), color in zip(reached.items(), GAITS, strict=False):
+        ax.axhline(distance, color=color, lw=2, label=label)
+    for i, (label, curve) in enumerate(curves.items()):
+        steps = [point["steps"] / 1e6 for point in curve]
+        distances = [point["distance_m"] for point in curve]
+        ax.plot(steps, distances, color=POLICY, ls=STYLES[i % len(STYLES)], lw=1.3, label=label)
+    ax.set(xlabel="environment steps (millions)", ylabel="distance in an episode (m)", title="learning curves")
+    ax.legend(loc="lower right", frameon=False)
+
+
+def _angles(ax: Axes, env: LocomotionEnv, one: Shown) -> None:
+    time, last = _window(env, one)
+    for i, joint in enumerate(joint_index(env.mechanism)):
+        name = env.mechanism.coordinates[joint]
+        angle, label = one.episodes.q[0, last, joint], f"${_math(name)}$"
+        if name not in env.mechanism.joint_limits:  # a rotor may also turn steadily, which would dwarf the rest
+            angle, label = angle - _drift(angle), f"{label}, drift removed"
+        ax.plot(time, angle, color=JOINTS[i], ls=STYLES[i], label=label)
+    ax.set(ylabel="joint angle (rad)", title=f"{one.label}, last {WINDOW:g} s")
+    _legend_above(ax)
+
+
+def _torques(ax: Axes, env: LocomotionEnv, one: Shown) -> None:
+    time, last = _window(env, one)
+    for i, control in enumerate(env.mechanism.controls):
+        torque = one.episodes.torques[0, last[:-1], i]
+        ax.stairs(torque, time, baseline=None, color=JOINTS[i], ls=STYLES[i], lw=1.3, label=f"${_math(control)}$")
+    ax.set(xlabel="time (s)", ylabel="torque (N m)")
+    _legend_above(ax)
+
+
+def _legend_above(ax: Axes) -> None:
+    handles, labels = ax.get_legend_handles_labels()
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + 0.25 * (high - low))  # room for the legend
+    ax.legend(handles, labels, loc="upper right", frameon=False, ncols=len(labels), borderaxespad=0)
+
+
+def _math(name: str) -> str:
+    """Name in the notation of Matplotlib's formulas: u_psi is u with the index ψ."""
+    return "_".join(rf"\{part}" if part in GREEK else part for part in name.split("_"))
+
+
+def _drift(values: np.ndarray) -> np.ndarray:
+    """Parabola through values."""
+    steps = np.arange(len(values))
+    return np.polynomial.Polynomial.fit(steps, values, 2)(steps)
+
+
+def _window(env: LocomotionEnv, one: Shown) -> tuple[np.ndarray, np.ndarray]:
+    steps = one.episodes.torques.shape[1]
+    last = np.arange(max(0, steps - round(WINDOW / env.dt)), steps + 1)
+    return last * env.dt, last

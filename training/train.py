@@ -1,0 +1,253 @@
+"""Train PPO on one environment.
+
+python -m training.train --env-id nhenv/SnakeboardForward-v0 --seed 0
+
+It may be interrupted, by Ctrl-C or worse: the same command goes on from the last checkpoint, and
+the outcome is the same to the last bit as without the interruption.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import pickle
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
+from training.evaluate import PolicyController, locomotion, make_envs, measure, rollout
+from training.progress import Interrupted, Job, Report, ignore, run_jobs
+from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
+
+__all__ = ["ppo_path", "ppo_settings", "train_piece"]
+
+_CODE = source_digest(__file__)
+
+
+def make_vec_env(env_id: str, n_envs: int) -> VecEnv:
+    """Environments for Stable-Baselines3; the one place that chooses their kind."""
+    return DummyVecEnv([lambda: StaggeredStart(gym.make(check_env_id(env_id)))] * n_envs)
+
+
+class StaggeredStart(gym.Wrapper[Any, Any, Any, Any]):
+    """Truncates the first episode at a random step, so that environments side by side are not in phase."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self._left: int | None = None
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        """Reset; the first time, draw when to truncate."""
+        result = self.env.reset(**arguments)
+        if self._left is None:
+            self._left = int(self.np_random.integers(1, self.get_wrapper_attr("_max_episode_steps"), endpoint=True))
+        return result
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step, and truncate when it is time."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        assert self._left is not None
+        self._left -= 1
+        return observation, reward, terminated, truncated or self._left == 0, info
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Schedule of Stable-Baselines3, from `first` to `last`; a closure would not survive pickling."""
+
+    first: float
+    last: float
+
+    def __call__(self, remaining: float) -> float:
+        """Value when this fraction of the training remains."""
+        return self.last + remaining * (self.first - self.last)
+
+
+class Run(BaseCallback):
+    """Draws the learning curve and keeps checkpoints, between an update and the next rollout.
+
+    There, the model, the environments and the random generators are all that there is to remember.
+
+    Attributes:
+        curve: points {"steps", "cpu_s", "return", "distance_m"} of the deterministic policy.
+    """
+
+    def __init__(self, env_id: str, config: PPOConfig, checkpoint: Path, report: Report) -> None:
+        super().__init__()
+        self.config, self.checkpoint, self.report = config, checkpoint, report
+        self.curve: list[dict[str, float]] = []
+        self._envs = make_envs(env_id, config.curve_episodes)
+        self._before = {"wall_s": 0.0, "cpu_s": 0.0}  # spent before an interruption
+        self._began = _clocks()
+
+    @property
+    def spent(self) -> dict[str, float]:
+        """Wall and CPU seconds of this run, interrupted or not."""
+        return {name: self._before[name] + now - self._began[name] for name, now in _clocks().items()}
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        steps = self.model.num_timesteps
+        updates = steps // (self.config.n_envs * self.config.n_steps)
+        if updates % self.config.curve_every == 0 and not (self.curve and self.curve[-1]["steps"] == steps):
+            self.draw()
+        try:
+            self.report(steps, self.config.timesteps, f"{self.curve[-1]['distance_m']:.1f} m")
+        except Interrupted:
+            self.save()
+            raise
+        if updates and updates % self.config.checkpoint_every == 0:
+            self.save()
+
+    def draw(self) -> None:
+        """Add a point to the learning curve."""
+        assert isinstance(self.model, PPO)
+        seeds = range(TUNING_SEEDS, TUNING_SEEDS + len(self._envs))
+        numbers = measure(locomotion(self._envs[0]), rollout(PolicyController(self.model), self._envs, seeds))
+        point = {"steps": self.model.num_timesteps, "cpu_s": self.spent["cpu_s"]}
+        self.curve.append(point | {name: float(numbers[name].mean()) for name in ("return", "distance_m")})
+
+    def save(self) -> None:
+        """Write everything that the rest of the run depends on."""
+        model = io.BytesIO()
+        self.model.save(model)
+        state = {
+            "model": model.getvalue(),
+            "envs": self.model.env,
+            "torch": torch.get_rng_state(),
+            "numpy": np.random.get_state(),  # noqa: NPY002 (SB3 shuffles its minibatches with it)
+            "curve": self.curve,
+            "spent": self.spent,
+        }
+        write_bytes(self.checkpoint, pickle.dumps(state))
+
+    def load(self) -> PPO:
+        """Go on where `save` was called. This unpickles a file of our own."""
+        state = pickle.loads(self.checkpoint.read_bytes())  # noqa: S301
+        model = PPO.load(io.BytesIO(state["model"]), env=state["envs"], device="cpu", force_reset=False)
+        self.curve, self._before = state["curve"], state["spent"]
+        torch.set_rng_state(state["torch"])  # last: making the model drew random numbers
+        np.random.set_state(state["numpy"])  # noqa: NPY002
+        return model
+
+
+def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
+    """An untrained model."""
+    return PPO(
+        "MlpPolicy",
+        make_vec_env(env_id, config.n_envs),
+        learning_rate=Linear(*config.learning_rate),
+        n_steps=config.n_steps,
+        batch_size=config.batch_size,
+        n_epochs=config.n_epochs,
+        gamma=config.gamma,
+        gae_lambda=config.gae_lambda,
+        clip_range=config.clip_range,
+        target_kl=config.target_kl,
+        policy_kwargs={
+            "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
+            "activation_fn": torch.nn.Tanh,
+            "log_std_init": config.log_std,
+        },
+        seed=training_seed(seed),
+        device="cpu",
+    )
+
+
+def train_piece(env_id: str, config: PPOConfig, seed: int, out: Path, report: Report = ignore) -> None:
+    """Train and write the policy (.zip) and its history (.json), unless that is done; go on from a checkpoint.
+
+    Args:
+        env_id: environment.
+        config: settings.
+        seed: number of the run.
+        out: folder of the results.
+        report: hears of every update.
+    """
+    torch.set_num_threads(1)
+    path = ppo_path(env_id, config, seed, out)
+    if path.exists():
+        return
+    run = Run(env_id, config, path.with_suffix(".checkpoint"), report)
+    model = run.load() if run.checkpoint.exists() else make_model(env_id, config, seed)
+    model.set_logger(Logger(None, []))  # else each run leaves a folder in the system's temporary one
+    model.learn(config.timesteps - model.num_timesteps, callback=run, reset_num_timesteps=False)
+    run.draw()
+    policy = io.BytesIO()
+    model.save(policy)
+    write_bytes(path.with_suffix(".zip"), policy.getvalue())
+    result = {"curve": run.curve, "steps": model.num_timesteps, **run.spent, "versions": versions()}
+    write_json(path, {"settings": ppo_settings(env_id, config, seed), "result": result})
+    run.checkpoint.unlink(missing_ok=True)
+
+
+def ppo_settings(env_id: str, config: PPOConfig, seed: int) -> dict[str, Any]:
+    """All that a trained policy follows from."""
+    return settings(env_id, _CODE, ppo=config, seed=seed)
+
+
+def ppo_path(env_id: str, config: PPOConfig, seed: int, out: Path) -> Path:
+    """File of a finished run's history; the policy is beside it, as .zip."""
+    return piece_path(out, ppo_settings(env_id, config, seed), f"ppo-seed{seed}")
+
+
+def _clocks() -> dict[str, float]:
+    return {"wall_s": time.perf_counter(), "cpu_s": time.process_time()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train PPO on one environment; the same command again goes on after an interruption.
+
+    Attributes:
+        env_id: environment.
+        seed: number of the run.
+        timesteps: environment steps; None for the settings of the task.
+        out: folder of the results.
+    """
+
+    env_id: str
+    seed: int = 0
+    timesteps: int | None = None
+    out: Path = Path("runs/train")
+
+    def __post_init__(self) -> None:
+        check_env_id(self.env_id)
+        training_seed(self.seed)
+
+
+def main(options: Train) -> None:
+    """Train under a progress bar."""
+    config = for_env(options.env_id).ppo
+    if options.timesteps is not None:
+        config = dataclasses.replace(config, timesteps=options.timesteps)
+    path = ppo_path(options.env_id, config, options.seed, options.out).with_suffix(".zip")
+    job = Job(f"{options.env_id} seed {options.seed}", train_piece, (options.env_id, config, options.seed, options.out))
+    console = Console()
+    try:
+        run_jobs([job], 1, console)
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command goes on from the checkpoint")
+    console.print(f"policy: {path}\njudge it: python -m training.evaluate {path}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    # Under its own name, so that what a checkpoint pickles is found by other programs too.
+    from training.train import Train, main
+
+    main(tyro.cli(Train, prog="python -m training.train"))
