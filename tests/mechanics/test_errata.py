@@ -189,3 +189,32 @@ def test_at_the_singular_angle_the_racer_can_do_more_than_rotate():
     roll = np.array([0.1 * np.cos(0.7), 0.1 * np.sin(0.7), 0, sine])
     # Rounding of 0.1 + 0.2 cos(2π/3).
     np.testing.assert_allclose(forms @ np.column_stack([turn, roll]), 0, atol=1e-15)
+
+
+def test_the_symmetric_product_of_section_6_1():
+    """<X2 : X3> = Σ_k (Γ̃^k_23 + Γ̃^k_32) X_k has mℓ² - J_r sin²φ below, as the multipliers say of Γ̃²₃₂ above."""
+    gamma = reduce(mechanics.get("snakeboard"), "paper").christoffel
+    product = [gamma[up, 1, 2] + gamma[up, 2, 1] for up in range(3)]
+    corrected, printed = -J_r * co * s / D, -J_r * co * s / D_PRINTED
+    assert sp.simplify(product[0] - J_r / (m * l**2) * co) == 0
+    assert sp.simplify(product[1] - corrected) == 0
+    assert sp.simplify(product[1] - printed) != 0
+    assert product[2] == 0
+
+
+def test_the_steered_right_angle_that_section_6_1_leaves_out():
+    """At φ = π/2, <X2 : X3> vanishes but <X3 : <X2 : X3>> does not, and X1, X2, X3 still span D's extension.
+
+    There <X3 : f X1 + g X2> = X3(f) X1 + X3(g) X2, because f and g are zero.
+    """
+    board = mechanics.get("snakeboard")
+    gamma = reduce(board, "paper").christoffel
+    product = [gamma[up, 1, 2] + gamma[up, 2, 1] for up in range(2)]
+    at = {phi: sp.pi / 2}
+    assert [f.subs(at) for f in product] == [0, 0]
+    assert sp.simplify(product[0].diff(phi).subs(at) + J_r / (m * l**2)) == 0
+    values = {**board.parameters, "x": 0.1, "y": 0.2, "theta": 0.3, "psi": 0.4, "phi": np.pi / 2}
+    assert np.linalg.matrix_rank(board.numeric(board.frames["paper"], values)) == 3
+    assert (
+        np.linalg.matrix_rank(board.numeric(board.one_forms, values), tol=1e-12) == 1
+    )  # the rows lose rank, D does not
