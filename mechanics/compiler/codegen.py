@@ -337,7 +337,6 @@ class _Body:
         self.constants: set[sp.Symbol] = set()
         self._program = program
         self._printer = _Printer()
-        self._fixed: dict[sp.Symbol, str] = {}  # temporaries that hold over the whole step
         self._moving: dict[sp.Symbol, bool] = {}
 
     def assign(self, name: str, value: str) -> str:
