@@ -182,10 +182,7 @@ class Mechanism:
         for name, value in (params or {}).items():
             if name not in values:
                 raise MechanismError(f"{self.name}: {unknown_name('parameter', name, values)}")
-            try:
-                values[name] = float(value)
-            except (TypeError, ValueError):
-                raise MechanismError(f"{self.name}: parameter {name} must be a number, not {value!r}") from None
+            values[name] = _number(value, f"{self.name}: parameter {name}")
         for name, value in values.items():
             if not math.isfinite(value):
                 raise MechanismError(f"{self.name}: parameter {name} = {value} is not finite")
@@ -221,12 +218,16 @@ class Mechanism:
 
         return {name: sp.Symbol(name) for name in (*self.coordinates, *self.parameters, *self.controls)}
 
-    def symbolic(self, text: str) -> sp.Expr:
-        """Exact SymPy expression of one entry, definitions written out."""
-        scope: dict[str, Any] = dict(self.symbols)
+    def scope(self, fixed: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """SymPy meaning of every name, definitions written out, with the values in `fixed` put in."""
+        scope: dict[str, Any] = {**self.symbols, **(fixed or {})}
         for name, definition in self.definitions.items():
             scope[name] = to_sympy(definition, scope)
-        return to_sympy(text, scope)
+        return scope
+
+    def symbolic(self, text: str) -> sp.Expr:
+        """Exact SymPy expression of one entry."""
+        return to_sympy(text, self.scope())
 
     # -- checks --------------------------------------------------------------------------------
 
@@ -279,10 +280,9 @@ class Mechanism:
 
     def _check_expressions(self) -> None:
         known = {*self.coordinates, *self.parameters}
-        texts = [(f"definition {name!r}", text) for name, text in self.definitions.items()]
-        for kind, text in texts:
-            self._check_known(kind, text, known)
-            known = known | {kind.split("'")[1]}
+        for name, text in self.definitions.items():
+            self._check_known(f"definition {name!r}", text, known)
+            known.add(name)
         entries = [("inertia", t) for row in self.inertia for t in row]
         entries += [("one_forms", t) for row in self.one_forms for t in row]
         entries += [(f"force {name!r}", t) for name, row in self.forces.items() for t in row]

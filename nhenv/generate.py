@@ -98,6 +98,10 @@ class _Generator:
             offset += size
         return places
 
+    def _places(self) -> dict[str, int]:
+        """Part of the memory -> its first place."""
+        return {name: start for name, (start, _) in self.memory.items()}
+
     def _method(self) -> tuple[Method, int]:
         """Integrator and substeps: as asked, or the default for this graph."""
         name, substeps = CORE if self.flow.core else LAYERED
@@ -194,7 +198,7 @@ class _Generator:
         states = [state.name for state in self.flow.states]
         old, new = (f"{', '.join(f'{name}__{when}' for name in states)}, " for when in ("old", "new"))
         controls = [f"{control.name}__u" for control in self.equations.controls]
-        place = {name: start for name, (start, _) in self.memory.items()}
+        place = self._places()
         state = _items("memory", len(states), place["state"])
         nothing = "0.0, " * (1 + len(self.judgement))
         lines = []
@@ -249,7 +253,7 @@ class _Generator:
 
     def _through_impacts(self, old: str, new: str, controls: list[str], flight: str) -> list[str]:
         """Accept free flight if no joint can have met its stop, else integrate from impact to impact."""
-        place = {name: start for name, (start, _) in self.memory.items()}
+        place = self._places()
         away, safe = [], []
         for j, (angle, rate) in enumerate(self.joints):
             stop = f"memory[{place['stop'] + j}]"

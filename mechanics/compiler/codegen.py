@@ -292,7 +292,6 @@ class _Stage(_Point):
             and expression.args[0] in self._flow.rates
             and expression.args[0] not in self._flow.solutions
             and self._method.explicit
-            and not self._at_start
         )
 
     def circle(self, function: type[sp.sin] | type[sp.cos], angle: sp.Symbol) -> str:

@@ -113,11 +113,8 @@ class _Reduction:
 
         # Lemma 3.3: at the group identity the heading is gone before any algebra.
         identity = dict.fromkeys(mechanism.fibre, sp.S.Zero) if self.symmetry else {}
-        scope: dict[str, Any] = {**symbols, **identity}
-        definitions = []
-        for name, text in mechanism.definitions.items():
-            scope[name] = to_sympy(text, scope)
-            definitions.append(scope[name])
+        scope = mechanism.scope(identity)
+        definitions = [scope[name] for name in mechanism.definitions]
         fields = [[to_sympy(text, scope) for text in row] for row in rows]
         inertia = [[to_sympy(text, scope) for text in row] for row in mechanism.inertia]
         forces = [[to_sympy(text, scope) for text in row] for row in mechanism.forces.values()]

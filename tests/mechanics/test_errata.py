@@ -85,22 +85,19 @@ ROLLER_RACER = {
 }
 
 
-@pytest.mark.parametrize("row", SNAKEBOARD)
-def test_snakeboard(row):
-    component, printed, corrected, zero = SNAKEBOARD[row]
-    board = mechanics.get("snakeboard")
-    values = state(board, **dict.fromkeys(zero, 0.0))
-    assert error(board, values, component, corrected) < AGREES
-    assert error(board, values, component, printed) > MISPRINT
+ROWS = {
+    **{("snakeboard", what): row for what, row in SNAKEBOARD.items()},
+    **{("roller_racer", what): row for what, row in ROLLER_RACER.items()},
+}
 
 
-@pytest.mark.parametrize("row", ROLLER_RACER)
-def test_roller_racer(row):
-    component, printed, corrected, zero = ROLLER_RACER[row]
-    racer = mechanics.get("roller_racer")
-    values = state(racer, **dict.fromkeys(zero, 0.0))
-    assert error(racer, values, component, corrected) < AGREES
-    assert error(racer, values, component, printed) > MISPRINT
+@pytest.mark.parametrize(("name", "what"), ROWS)
+def test_the_printed_form_is_wrong_and_the_corrected_one_right(name, what):
+    component, printed, corrected, zero = ROWS[name, what]
+    mechanism = mechanics.get(name)
+    values = state(mechanism, **dict.fromkeys(zero, 0.0))
+    assert error(mechanism, values, component, corrected) < AGREES
+    assert error(mechanism, values, component, printed) > MISPRINT
 
 
 def test_the_rest_of_section_5_is_right():
