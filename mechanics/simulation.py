@@ -112,11 +112,10 @@ def _integrate(
     zero = [0.0] * len(model.mechanism.forces)
     while start < end:
         bound, following = end, end
-        earliest = start  # values before belong to the piece before a jump
 
         def rates(time: float, y: Array) -> Array:
-            # Bound when called: a piece that ends at a jump must not look beyond it.
-            u = zero if torque is None else torque(min(max(time, earliest), bound)).tolist()  # noqa: B023
+            # The last stage may be rounded beyond the end of a piece, to the far side of a jump.
+            u = zero if torque is None else torque(min(time, bound)).tolist()  # noqa: B023 (the present bound)
             return np.array(model.scalar_rates(y.tolist(), u))
 
         solver = DOP853(rates, start, state, bound, rtol=rtol, atol=atol)
