@@ -1,20 +1,26 @@
-"""Print the reduced equations of a mechanism: `python -m mechanics snakeboard --frame paper`."""
+"""Print the reduced equations of a mechanism: `python -m mechanics snakeboard --frame paper`.
+
+`python -m mechanics FILE.toml` does the same for a mechanism of your own (`Mechanism.from_file`),
+and `python -m mechanics` lists the catalogue.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import tyro
 
-from mechanics.catalog import get
+from mechanics.catalog import get, names
+from mechanics.expressions import to_sympy
 from mechanics.mechanism import Mechanism, MechanismError
 
 if TYPE_CHECKING:
     from mechanics.geometry import ReducedEquations
 
-__all__ = ["main", "report"]
+__all__ = ["catalogue", "main", "report"]
 
 SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
@@ -30,45 +36,73 @@ TILDE = "\N{COMBINING TILDE}"
 
 
 def main(
-    name: Annotated[str, tyro.conf.Positional],
+    name: Annotated[str, tyro.conf.Positional] = "",
     frame: str | None = None,
+    drag: bool = False,
     shorthands: bool = True,
 ) -> None:
     """Derive and print the equations of motion of a mechanism.
 
     Args:
-        name: a mechanism of the catalogue, such as snakeboard or roller_racer.
+        name: a mechanism of the catalogue, such as snakeboard or roller_racer, or a file that ends in .toml or
+            .json; the catalogue is listed if left out.
         frame: name of one of its frames; the default frame if left out.
+        drag: let the mechanism's drag act.
         shorthands: write the mechanism's own shorthands (such as f_1) instead of what they stand for.
     """
+    if not name:
+        print("\n".join(catalogue()))
+        return
     try:
-        mechanism = get(name)
+        mechanism = Mechanism.from_file(name) if _is_path(name) else get(name)
         mechanism.frame_rows(frame)
+        mechanism.drag_coefficients(drag)
     except MechanismError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        _fail(str(error), *(() if _is_path(name) or name in names() else catalogue()))
 
     from rich.console import Console
 
-    from mechanics.geometry import reduce
+    from mechanics.geometry.reduction import derive
 
+    try:
+        equations = derive(mechanism, frame, drag=drag)
+    except (ValueError, ArithmeticError, RecursionError) as error:
+        _fail(f"{mechanism.name} cannot be reduced: {error}")
     # Soft wrap: a formula is cut by the terminal, not by us, and copies as one line.
     console = Console(highlight=False, soft_wrap=True, markup=False)
-    frame = frame or next(iter(mechanism.frames))
-    for title, lines in report(reduce(mechanism, frame), frame, shorthands):
+    frame = frame or next(iter(mechanism.frames), None)
+    for title, lines in report(equations, frame, shorthands):
         console.print(title, style="bold cyan")
         for line in lines:
             console.print(f"  {line}")
 
 
-def report(e: ReducedEquations, frame: str, shorthands: bool = True) -> Iterator[tuple[str, list[str]]]:
+def catalogue() -> Iterator[str]:
+    """A line on each mechanism of the catalogue."""
+    width = max(map(len, names()))
+    for m in map(get, names()):
+        numbers = f"{m.n} coordinates, {m.rank} velocities, {len(m.controls)} controls"
+        yield f"{m.name:{width}}  {numbers}: {m.citation.split(';')[0]}"
+
+
+def _is_path(name: str) -> bool:
+    return bool(Path(name).suffix) or Path(name).name != name
+
+
+def _fail(*lines: str) -> NoReturn:
+    print("\n".join(("error: " + lines[0], *lines[1:])), file=sys.stderr)
+    raise SystemExit(2)
+
+
+def report(e: ReducedEquations, frame: str | None, shorthands: bool = True) -> Iterator[tuple[str, list[str]]]:
     """Sections of the printout, each with its title and lines.
 
     Args:
         e: the reduced equations.
-        frame: what to call their frame.
+        frame: what to call their frame, None if it was found.
         shorthands: write the mechanism's definitions by name.
     """
+    from mechanics.compiler.codegen import needed
     from mechanics.geometry.counting import count_operations
 
     write = _Writer(e.mechanism, shorthands)
@@ -84,7 +118,8 @@ def report(e: ReducedEquations, frame: str, shorthands: bool = True) -> Iterator
         f"{write(e.squared_norms[i])}"
         for i in k
     ]
-    yield f"Frame {frame!r} of the velocities that the constraints allow", columns
+    which = "Frame found" if frame is None else f"Frame {frame!r}"
+    yield f"{which} of the velocities that the constraints allow", columns
     gamma = [
         f"Γ{TILDE}{_sup(up)}{_sub(i)}{_sub(j)} = {write(e.christoffel[up, i, j])}"
         for up in k
@@ -100,11 +135,29 @@ def report(e: ReducedEquations, frame: str, shorthands: bool = True) -> Iterator
         if e.input_coefficients[i, a] != 0
     ]
     yield "Input coefficients", inputs
+    if m.potential != "0":
+        gradients = [f"-X{_sub(i)}(V)/‖X{_sub(i)}‖² = {write(e.potential_acceleration[i])}" for i in k]
+        yield "Potential energy and what it adds to the accelerations", [f"V = {write.text(m.potential)}", *gradients]
+    if any(e.drag):
+        tensor = [f"R{_sup(i)}{_sub(j)} = {write(e.drag[i, j])}" for i in k for j in k if e.drag[i, j] != 0]
+        defaults = [f"{write.name(c)} = {value:g}" for c, value in m.drag.items()]
+        yield (
+            "Drag: Rayleigh's function, its defaults in SI units, and what multiplies -v",
+            [
+                f"R = {write.text(m.rayleigh)}",
+                *defaults,
+                *tensor,
+            ],
+        )
     yield "Kinematic equations", [f"{_dot(a)} = {write(r)}" for a, r in zip(q, e.velocity, strict=True)]
     yield "Dynamic equations", [f"{_dot(a)} = {write(r)}" for a, r in zip(v, e.acceleration, strict=True)]
+    printed = [e.frame, e.squared_norms, e.christoffel, e.input_coefficients, e.potential_acceleration, e.drag]
+    formulas = [*e.velocity, *e.acceleration]
+    if steps := needed([*formulas, *(entry for array in printed for entry in array)], e.definitions):
+        yield "Steps that these formulas share", [f"{s.name} = {write(value)}" for s, value in steps.items()]
     if where := write.used():
         yield "where", where
-    everything = [*e.velocity, *e.acceleration]
+    everything = [*needed(formulas, e.definitions).values(), *formulas]
     yield (
         "Operations of one evaluation, common subexpressions shared",
         [
@@ -140,8 +193,9 @@ class _Writer:
         self.mechanism = mechanism
         self._seen: set[str] = set()
         # Longest first: f_1 contains c, and is looked for before it.
+        self.scope = mechanism.scope()
         self.rules = {
-            mechanism.symbolic(name): sp.Symbol(name) for name in reversed(tuple(mechanism.definitions)) if shorthands
+            self.scope[name]: sp.Symbol(name) for name in reversed(tuple(mechanism.definitions)) if shorthands
         }
 
     def __call__(self, expression: Any) -> str:
@@ -149,6 +203,13 @@ class _Writer:
         short = expression.xreplace(self.rules)
         self._seen |= {s.name for s in short.free_symbols}
         return self.print(short).replace("*", " ")
+
+    def text(self, text: str) -> str:
+        """One line for an expression of the mechanism."""
+        import sympy as sp
+
+        rates = {rate: sp.Symbol(rate) for rate in self.mechanism.rates}
+        return self(to_sympy(text, self.scope | rates))
 
     def used(self) -> list[str]:
         """Lines `name = expression` of the shorthands used so far and of those they use."""
@@ -162,7 +223,9 @@ class _Writer:
 
 
 def _name(name: str) -> str:
-    """u_psi as u_ψ, l_1 as l₁, J_r as J_r."""
+    """u_psi as u_ψ, l_1 as l₁, J_r as J_r, x_dot as ẋ."""
+    if name.endswith("_dot"):
+        return _dot(_name(name.removesuffix("_dot")))
     base, _, index = name.partition("_")
     if not index and base[-1:].isdigit():
         base, index = base.rstrip("0123456789"), base[len(base.rstrip("0123456789")) :]

@@ -34,6 +34,7 @@ class Model:
         mechanism: what moves.
         params: values that replace the mechanism's defaults.
         frame: as in `mechanics.reduce`.
+        drag: False or None for none, True for the mechanism's own, or coefficients by name.
     """
 
     def __init__(
@@ -41,13 +42,16 @@ class Model:
         mechanism: Mechanism,
         params: Mapping[str, float] | None = None,
         frame: str | Sequence[Sequence[str]] | None = None,
+        drag: bool | Mapping[str, float] | None = None,
     ) -> None:
         self.mechanism = mechanism
         self.params = mechanism.resolve(params)
         rows = mechanism.frame_rows(frame)
-        specification = {"mechanism": mechanism.to_dict(), "frame": rows}
-        self._functions = kernels.load(f"{mechanism.name}_model", specification, lambda: _source(mechanism, rows))
-        self._constants = np.array(self._functions.constants(list(self.params.values())))
+        coefficients = mechanism.drag_coefficients(drag)
+        acts = drag is not None and drag is not False
+        specification = {"mechanism": mechanism.to_dict(), "frame": rows, "drag": acts}
+        self._functions = kernels.load(f"{mechanism.name}_model", specification, lambda: _source(mechanism, rows, acts))
+        self._constants = np.array(self._functions.constants([*self.params.values(), *coefficients.values()]))
 
     def project(self, q: ArrayLike, qdot: ArrayLike) -> Array:
         """Pseudo-velocities v (..., k) of velocities q̇ (..., n), orthogonally projected onto D."""
@@ -70,7 +74,7 @@ class Model:
         return self._call("velocity", (q, self.mechanism.n, "q"), (v, self.mechanism.rank, "v"))
 
     def rates(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
-        """Rates of the pseudo-velocities, -Γ̃(q) v v + Y(q) u + potential part, shape (..., k)."""
+        """Rates of the pseudo-velocities, -Γ̃(q) v v + Y(q) u + potential and drag parts, shape (..., k)."""
         return self._call("rates", *self._state(q, v), (u, len(self.mechanism.forces), "u"))
 
     def acceleration(self, q: ArrayLike, v: ArrayLike, u: ArrayLike) -> Array:
@@ -129,14 +133,14 @@ def acceleration(
     return model.acceleration(q, model.feasible(q, qdot), u)
 
 
-def _source(mechanism: Mechanism, rows: Any) -> str:
+def _source(mechanism: Mechanism, rows: Any, drag: bool) -> str:
     """Generate the NumPy module of a mechanism in a frame."""
     import sympy as sp
 
-    from mechanics.compiler.codegen import BACKENDS, Program
-    from mechanics.geometry.reduction import reduce
+    from mechanics.compiler.codegen import BACKENDS, Program, needed
+    from mechanics.geometry.reduction import derive
 
-    equations: ReducedEquations = reduce(mechanism, rows)
+    equations: ReducedEquations = derive(mechanism, rows, drag=drag)
     q, v, u = equations.coordinates, equations.pseudo_velocities, equations.controls
     qdot = sp.symbols([f"{c.name}__dot" for c in q])
     forms = [[mechanism.symbolic(text) for text in row] for row in mechanism.one_forms]
@@ -150,28 +154,35 @@ def _source(mechanism: Mechanism, rows: Any) -> str:
         ),
         sp.S.Zero,
     )
+    # Rates of the definitions, by the chain rule along the motion.
+    definitions, change = list(equations.definitions), dict(rate_of)
+
+    def along(expression: sp.Expr) -> sp.Expr:
+        """Derivative along the motion."""
+        moving = sorted(expression.free_symbols & change.keys(), key=str)
+        return sum((sp.diff(expression, s) * change[s] for s in moving), sp.S.Zero)
+
+    for symbol, expression in needed(equations.velocity, equations.definitions).items():
+        change[symbol] = sp.Symbol(f"{symbol.name}_rate")
+        definitions.append((change[symbol], along(expression)))
     groups: dict[str, tuple[tuple[Any, ...], list[sp.Expr]]] = {
         "project": ((*q, *qdot), list(equations.projection * sp.Matrix(qdot))),
         "velocity": ((*q, *v), list(equations.velocity)),
         "rates": ((*q, *v, *u), list(equations.acceleration)),
-        # The derivative of X(q) v along the motion.
-        "acceleration": (
-            (*q, *v, *u),
-            [sum((sp.diff(e, s) * r for s, r in rate_of.items()), sp.S.Zero) for e in equations.velocity],
-        ),
+        "acceleration": ((*q, *v, *u), [along(e) for e in equations.velocity]),
         "energy": ((*q, *v), [equations.energy]),
         "power": ((*q, *v, *u), [power]),
         "residual": ((*q, *qdot), [sum(a * b for a, b in zip(row, qdot, strict=True)) for row in forms]),
         "right_hand_side": ((*q, *v, sp.Symbol("_work"), *u), [*rate_of.values(), power]),
     }
     outputs = {f"{group}:{i}": e for group, (_, es) in groups.items() for i, e in enumerate(es)}
-    program = Program(outputs, equations.parameters)
+    program = Program(outputs, equations.parameters, definitions)
     numpy = BACKENDS["numpy"]
     functions = [
         program.function(group, arguments, [f"{group}:{i}" for i in range(len(expressions))], numpy)
         for group, (arguments, expressions) in groups.items()
     ]
-    title = f'"""{mechanism.name}: numerical functions in the frame {[list(row) for row in rows]}. Do not edit."""\n'
+    title = f'"""{mechanism.name}: numerical functions in the frame {equations.frame.T.tolist()}. Do not edit."""\n'
     return "\n\n".join(
         [title + numpy.header, program.constants_function("constants", equations.parameters), *functions]
     )

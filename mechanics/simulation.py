@@ -58,6 +58,7 @@ def simulate(
     controls: Callable[[float], ArrayLike] | None = None,
     params: Mapping[str, float] | None = None,
     frame: str | Sequence[Sequence[str]] | None = None,
+    drag: bool | Mapping[str, float] | None = None,
     rtol: float = 1e-10,
     atol: float = 1e-12,
 ) -> Trajectory:
@@ -76,6 +77,7 @@ def simulate(
             stops where it does.
         params: values that replace the mechanism's default parameters.
         frame: frame of the pseudo-velocities, as in `mechanics.reduce`.
+        drag: False or None for none, True for the mechanism's own, or coefficients by name.
         rtol: relative accuracy aimed at; single steps are held to a hundredth of it.
         atol: absolute accuracy aimed at, likewise.
 
@@ -83,7 +85,7 @@ def simulate(
         SimulationError: the solver failed or the motion ceased to be finite.
         MechanismError: an argument has the wrong shape, is not finite, or violates the constraints.
     """
-    model = Model(mechanism, params, frame)
+    model = Model(mechanism, params, frame, drag)
     times = _times(t)
     n, k = mechanism.n, mechanism.rank
     q = _vector(mechanism, q0, n, "q0")

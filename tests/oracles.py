@@ -9,34 +9,44 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from mechanics.expressions import to_sympy
 from mechanics.mechanism import Mechanism
 
 __all__ = ["frame_acceleration", "multiplier_acceleration"]
 
 
 def multiplier_acceleration(
-    mechanism: Mechanism, values: Mapping[str, float], qdot: Sequence[float], u: Sequence[float]
+    mechanism: Mechanism,
+    values: Mapping[str, float],
+    qdot: Sequence[float],
+    u: Sequence[float],
+    drag: Mapping[str, float] | None = None,
 ) -> np.ndarray:
     """Acceleration q̈ [n] by Lagrange-d'Alembert with multipliers.
 
-    Solves [[M, -ω^T], [ω, 0]] (q̈, λ) = (u_a F_a - ∇V - C(q, q̇), -ω̇ q̇), the textbook equations: no
-    frame, no connection, no projection.
+    Solves [[M, -ω^T], [ω, 0]] (q̈, λ) = (u_a F_a - ∇V - ∂R/∂q̇ - C(q, q̇), -ω̇ q̇), the textbook equations:
+    no frame, no connection, no projection.
 
     Args:
         mechanism: the mechanism.
         values: coordinates and parameters by name.
         qdot: [n] velocity that satisfies the constraints.
         u: [m] controls.
+        drag: coefficients of Rayleigh's function R, which does not act if there are none.
     """
     n, c = mechanism.n, len(mechanism.one_forms)
     function = _ingredients(mechanism.name, _key(mechanism), mechanism=_Box(mechanism))
     names = [*mechanism.coordinates, *mechanism.parameters]
-    M, dM, forms, dforms, forces, gradient = map(np.asarray, function(*(values[name] for name in names)))
+    coefficients = [(drag or {}).get(name, 0.0) for name in mechanism.drag]
+    numbers = function(*(values[name] for name in names), *coefficients, *qdot)
+    M, dM, forms, dforms, forces, gradient, braking = map(np.asarray, numbers)
     qdot = np.asarray(qdot, dtype=float)
     dM = dM.reshape(n, n, n)  # [c, a, b] = ∂_c M_ab
     # d/dt (M q̇) - ∂/∂q (1/2 q̇ M q̇)
     bias = np.einsum("cab,c,b->a", dM, qdot, qdot) - 0.5 * np.einsum("abc,b,c->a", dM, qdot, qdot)
     right = forces.reshape(-1, n).T @ np.asarray(u, dtype=float) - gradient.ravel() - bias
+    if drag is not None:
+        right = right - braking.ravel()
     if c:
         forms, dforms = forms.reshape(c, n), dforms.reshape(n, c, n)
         system = np.block([[M, -forms.T], [forms, np.zeros((c, c))]])
@@ -76,8 +86,11 @@ def _ingredients(name: str, key: str, *, mechanism: _Box) -> Any:
     ((V,),) = read([[m.potential]])
     dM = [[[sp.diff(e, c) for e in M.row(a)] for a in range(m.n)] for c in q]
     dforms = [[[sp.diff(e, c) for e in row] for row in forms] for c in q]
-    symbols = [real[m.symbols[s]] for s in (*m.coordinates, *m.parameters)]
-    return sp.lambdify(symbols, [M.tolist(), dM, forms, dforms, forces, [sp.diff(V, c) for c in q]], "numpy", cse=True)
+    rates = [sp.Symbol(name) for name in m.rates]
+    rayleigh = to_sympy(m.rayleigh, {**m.scope(), **{r.name: r for r in rates}}).xreplace(real)
+    symbols = [*(real[m.symbols[s]] for s in (*m.coordinates, *m.parameters, *m.drag)), *rates]
+    outputs = [M.tolist(), dM, forms, dforms, forces, [sp.diff(V, c) for c in q], [sp.diff(rayleigh, r) for r in rates]]
+    return sp.lambdify(symbols, outputs, "numpy", cse=True)
 
 
 def frame_acceleration(equations: Any, values: Mapping[str, float], v: Sequence[float], u: Sequence[float]) -> Any:

@@ -19,7 +19,7 @@ from sympy.printing.pycode import PythonCodePrinter
 from mechanics.compiler.dataflow import TAU, Dataflow, initial
 from mechanics.compiler.integrators import Method
 
-__all__ = ["BACKENDS", "Backend", "Program", "operation_count"]
+__all__ = ["BACKENDS", "Backend", "Program", "needed", "operation_count"]
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,17 @@ BACKENDS = {
     # Scalars or arrays of any shape, no compiler.
     "numpy": Backend(
         "numpy",
-        "from numpy import abs as fabs\nfrom numpy import arctan2 as atan2\n"
-        "from numpy import copysign, cos, exp, inf, isfinite, pi, sign, sin, sqrt, tan\n",
+        "from numpy import abs as fabs\nfrom numpy import arccos as acos\nfrom numpy import arcsin as asin\n"
+        "from numpy import arctan as atan\nfrom numpy import arctan2 as atan2\n"
+        "from numpy import copysign, cos, cosh, exp, inf, isfinite, log, pi, sign, sin, sinh, sqrt, tan, tanh\n",
         "",
     ),
     # Scalars, inlined into the kernel that calls them. fastmath without nnan and ninf: finiteness
     # is tested in the same code, and must not be assumed.
     "numba": Backend(
         "numba",
-        "from math import atan2, copysign, cos, exp, fabs, inf, isfinite, pi, sin, sqrt, tan\n\n"
+        "from math import acos, asin, atan, atan2, copysign, cos, cosh, exp, fabs, inf, isfinite, log, pi\n"
+        "from math import sin, sinh, sqrt, tan, tanh\n\n"
         "from numba import njit\nfrom numpy import sign\n",
         '@njit(error_model="numpy", fastmath={"contract", "nsz", "arcp"})\n',
     ),
@@ -68,6 +70,9 @@ class _Printer(PythonCodePrinter):
     def _print_Rational(self, expr: sp.Rational) -> str:
         return repr(float(expr))
 
+    def _print_Exp1(self, expr: sp.Expr) -> str:
+        return repr(float(expr))
+
     def _print_Function(self, expr: sp.Function) -> str:
         name = {"Abs": "abs"}.get(expr.func.__name__, expr.func.__name__)
         return f"{name}({', '.join(self._print(argument) for argument in expr.args)})"
@@ -81,22 +86,30 @@ class Program:
     Args:
         outputs: name -> expression.
         parameters: the symbols that are constant for the life of a kernel.
+        definitions: pairs of a symbol that the outputs may use and what it stands for.
     """
 
-    def __init__(self, outputs: Mapping[str, sp.Expr], parameters: Iterable[sp.Symbol]) -> None:
+    def __init__(
+        self,
+        outputs: Mapping[str, sp.Expr],
+        parameters: Iterable[sp.Symbol],
+        definitions: Sequence[tuple[sp.Symbol, sp.Expr]] = (),
+    ) -> None:
         self._parameters = frozenset(parameters)
         self._hoisted: dict[sp.Expr, sp.Symbol] = {}
         self._definition: dict[sp.Symbol, sp.Expr] = {}
         self._named: dict[sp.Expr, sp.Symbol] = {}
         expressions = {name: sp.sympify(expression) for name, expression in outputs.items()}
+        definitions_used = needed(expressions.values(), definitions)
         self._roots = {
             power.base
-            for expression in expressions.values()
+            for expression in (*expressions.values(), *definitions_used.values())
             for power in expression.atoms(sp.Pow)
             if power.exp.is_Rational and power.exp.q == 2
         }
         lowered = {name: self._lower(expression) for name, expression in expressions.items()}
-        temporaries = {symbol: expression for expression, symbol in self._named.items()}
+        temporaries = {symbol: self._lower(expression) for symbol, expression in definitions_used.items()}
+        temporaries |= {symbol: expression for expression, symbol in self._named.items()}
         # The definitions of named functions take part in the search for common subexpressions.
         shared, reduced = sp.cse(
             [*lowered.values(), *temporaries.values()], symbols=sp.numbered_symbols("_s"), order="none"
@@ -383,6 +396,19 @@ class _Body:
                 for inner in self._program.temporaries[symbol].free_symbols
             )
         return self._moving[symbol]
+
+
+def needed(
+    expressions: Iterable[sp.Expr], definitions: Sequence[tuple[sp.Symbol, sp.Expr]]
+) -> dict[sp.Symbol, sp.Expr]:
+    """The definitions that some expressions use, directly or through others."""
+    wanted = {symbol for expression in expressions for symbol in expression.free_symbols}
+    used = {}
+    for symbol, expression in reversed(definitions):
+        if symbol in wanted:
+            used[symbol] = expression
+            wanted |= expression.free_symbols
+    return dict(reversed(used.items()))
 
 
 def operation_count(program: Program) -> int:

@@ -68,15 +68,23 @@ class Dataflow:
         return tuple(state for layer in self.layers if layer.kind == "core" for state in layer.states)
 
 
-def analyse(rates: Mapping[sp.Symbol, sp.Expr], outputs: Iterable[sp.Expr]) -> Dataflow:
+def analyse(
+    rates: Mapping[sp.Symbol, sp.Expr],
+    outputs: Iterable[sp.Expr],
+    definitions: Iterable[tuple[sp.Symbol, sp.Expr]] = (),
+) -> Dataflow:
     """Prune the states that `outputs` do not reach, and sort the others into layers.
 
     Args:
         rates: state -> rate as an expression in states and in symbols constant over a step.
         outputs: expressions that are wanted at the end of a step.
+        definitions: pairs of a symbol that rates and outputs may use and what it stands for.
     """
-    uses = {state: _states_in(rate, rates) for state, rate in rates.items()}
-    kept = _reach(uses, {state for output in outputs for state in _states_in(output, rates)})
+    behind: dict[sp.Symbol, set[sp.Symbol]] = {state: {state} for state in rates}
+    for symbol, expression in definitions:
+        behind[symbol] = _states_in(expression, behind)
+    uses = {state: _states_in(rate, behind) for state, rate in rates.items()}
+    kept = _reach(uses, {state for output in outputs for state in _states_in(output, behind)})
     states = [state for state in rates if state in kept]
     layers: list[Layer] = []
     solutions: dict[sp.Symbol, sp.Expr] = {}
@@ -93,8 +101,9 @@ def analyse(rates: Mapping[sp.Symbol, sp.Expr], outputs: Iterable[sp.Expr]) -> D
     return Dataflow({state: rates[state] for state in states}, tuple(layers), solutions, pruned)
 
 
-def _states_in(expression: sp.Expr, rates: Mapping[sp.Symbol, sp.Expr]) -> set[sp.Symbol]:
-    return {symbol for symbol in sp.sympify(expression).free_symbols if symbol in rates}
+def _states_in(expression: sp.Expr, behind: Mapping[sp.Symbol, set[sp.Symbol]]) -> set[sp.Symbol]:
+    symbols = sp.sympify(expression).free_symbols
+    return {state for symbol in symbols if symbol in behind for state in behind[symbol]}
 
 
 def _reach(uses: Mapping[sp.Symbol, set[sp.Symbol]], wanted: set[sp.Symbol]) -> set[sp.Symbol]:
@@ -130,7 +139,7 @@ def _polynomial(
     state: sp.Symbol, rate: sp.Expr, used: set[sp.Symbol], solutions: Mapping[sp.Symbol, sp.Expr]
 ) -> sp.Expr | None:
     """Value of `state` at `TAU` if its rate is a polynomial in time of low degree, else None."""
-    if not used <= solutions.keys():
+    if not used <= solutions.keys() & rate.free_symbols:  # a definition hides what it does with a state
         return None
     in_time = rate.xreplace({other: solutions[other] for other in used})
     if not in_time.is_polynomial(TAU):

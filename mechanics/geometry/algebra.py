@@ -5,16 +5,15 @@ sines, cosines and square roots. As a field that is the rational functions in ge
 (one for each parameter, cosine, sine, root) modulo sin^2 = 1 - cos^2 and root^2 = radicand. An
 `Element` is kept in the normal form N/D with N linear in every sine and root, D free of them, and no
 common factor, so that equal elements are equal objects and zero is seen at once. This is what makes
-the derivation take a fraction of a second where `trigsimp` needs minutes. Very long fractions are left
-uncancelled (see the limits below): zero is still seen, equality is not.
+the derivation take a fraction of a second where `trigsimp` needs minutes. Long fractions are left
+uncancelled (see `polynomials`): zero is still seen, equality is not. Where products would become
+very long, `TooLong` says so, and `tape` has another arithmetic.
 """
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from operator import add, ge, sub
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,23 +21,41 @@ import sympy as sp
 from sympy.polys.domains import ZZ
 from sympy.polys.rings import PolyElement, PolyRing
 
-__all__ = ["Algebra", "Element", "exact_quotient"]
+from mechanics.geometry.polynomials import cancel, factor_list, lower, split_parity
 
-# Largest product of the numbers of terms for which a greatest common divisor is sought (0.1 s or
-# so). Beyond it a fraction stays as it is: longer than need be, still exact, and zero is still zero.
-GCD_LIMIT = 6_000
+__all__ = ["Algebra", "Element", "TooLong", "partials"]
+
+# Products of terms that a derivation may multiply out in all. The snakeboard takes a hundred, the
+# roller racer six thousand; one with a massive link takes 120 thousand and a second, and ends with
+# a third of the operations that it has otherwise; a snake of three links would take minutes.
+WORK_LIMIT = 200_000
 
 # Longest denominator that is made free of sines and roots (its length is squared by that).
 CONJUGATE_LIMIT = 8
+
+# Largest multiple or fraction of an angle whose sine is written in the angle's own: sin(1.37 x) would be a
+# polynomial of degree 137 in sin(x/100).
+MULTIPLES = 16
 
 # Derivatives of the functions that are not rational in sines and cosines: f(args) -> df/d(arg) for
 # each argument. SymPy's own rules for abs and sign speak of complex arguments.
 _PARTIALS: dict[Any, Any] = {
     sp.exp: lambda x: (sp.exp(x),),
+    sp.log: lambda x: (1 / x,),
+    sp.asin: lambda x: (1 / sp.sqrt(1 - x**2),),
+    sp.acos: lambda x: (-1 / sp.sqrt(1 - x**2),),
+    sp.atan: lambda x: (1 / (1 + x**2),),
+    sp.sinh: lambda x: (sp.cosh(x),),
+    sp.cosh: lambda x: (sp.sinh(x),),
+    sp.tanh: lambda x: (1 - sp.tanh(x) ** 2,),
     sp.Abs: lambda x: (sp.sign(x),),
     sp.sign: lambda x: (sp.S.Zero,),
     sp.atan2: lambda y, x: (x / (x**2 + y**2), -y / (x**2 + y**2)),
 }
+
+
+class TooLong(ArithmeticError):
+    """The products of a derivation have too many terms to be multiplied out."""
 
 
 class Element:
@@ -52,6 +69,7 @@ class Element:
     def __add__(self, other: Element) -> Element:
         if self.den == other.den:
             return self.algebra.ratio(self.num + other.num, self.den)
+        self.algebra.check_length((self.num, other.den), (other.num, self.den), (self.den, other.den))
         return self.algebra.ratio(self.num * other.den + other.num * self.den, self.den * other.den)
 
     def __sub__(self, other: Element) -> Element:
@@ -63,9 +81,11 @@ class Element:
     def __mul__(self, other: Element) -> Element:
         if not self.num or not other.num:
             return self.algebra.zero
+        self.algebra.check_length((self.num, other.num), (self.den, other.den))
         return self.algebra.ratio(self.num * other.num, self.den * other.den)
 
     def __truediv__(self, other: Element) -> Element:
+        self.algebra.check_length((self.num, other.den), (self.den, other.num))
         return self.algebra.ratio(self.num * other.den, self.den * other.num)
 
     def __pow__(self, exponent: int) -> Element:
@@ -81,6 +101,11 @@ class Element:
 
     def __hash__(self) -> int:
         return hash((self.num, self.den))
+
+    @property
+    def size(self) -> int:
+        """How long it is: number of terms; 0 for a number."""
+        return 0 if self.num.is_ground and self.den.is_ground else len(self.num) + len(self.den)
 
     @property
     def is_polynomial(self) -> bool:
@@ -99,8 +124,10 @@ class Algebra:
     """
 
     def __init__(self, expressions: Iterable[sp.Expr], samples: Mapping[str, Any]) -> None:
-        self._samples = {name: np.asarray(values, dtype=float) for name, values in samples.items()}
+        self.samples = {name: np.asarray(values, dtype=float) for name, values in samples.items()}
+        self.work = 0  # what was multiplied out so far
         self._sampled: dict[sp.Expr, Any] = {}  # generator -> its values at the sample points
+        self._functions: dict[sp.Expr, Any] = {}  # generator -> NumPy function of the symbols
         self._units: dict[sp.Expr, int] = {}  # argument of sines -> common denominator of its multiples
         leaves: dict[sp.Expr, None] = {}
         radicands: dict[sp.Expr, None] = {}
@@ -127,8 +154,8 @@ class Algebra:
                 continue
             if e.func in (sp.sin, sp.cos, sp.tan):
                 for term in sp.Add.make_args(sp.expand(e.args[0])):
-                    factor, core = term.as_coeff_Mul()
-                    self._units[core] = math.lcm(self._units.get(core, 1), sp.Rational(factor).q)
+                    factor, core = _multiple(term)
+                    self._units[core] = math.lcm(self._units.get(core, 1), factor.q)
                     if core is sp.pi:
                         pending.extend((sp.cos(term), sp.sin(term), sp.cos(core / self._units[core])))
                     elif not core.is_Symbol:
@@ -142,7 +169,7 @@ class Algebra:
             else:
                 leaves[e] = None
                 if e.args:
-                    pending.extend((*e.args, *_partials(e)))
+                    pending.extend((*e.args, *partials(e)))
 
     def _extend(self) -> None:
         """Make the ring anew after a generator was added."""
@@ -171,8 +198,8 @@ class Algebra:
 
     def _split_radicand(self, radicand: Element) -> list[tuple[PolyElement, int]]:
         """Write a radicand as a product of powers of positive factors, and at most one more factor."""
-        content, factors = radicand.num.factor_list()
-        below, divisors = radicand.den.factor_list()
+        content, factors = factor_list(radicand.num)
+        below, divisors = factor_list(radicand.den)
         rational = sp.Rational(int(content), int(below))
         positive: dict[PolyElement, int] = {}
         rest = self.ring.one
@@ -202,27 +229,40 @@ class Algebra:
         values = self._values(poly)
         return 1 if (values > 0).all() else -1 if (values < 0).all() else 0
 
-    def _values(self, poly: PolyElement) -> Any:
-        """Values [p] of a polynomial at the sample points."""
-        total = np.zeros(len(next(iter(self._samples.values()))))
+    def values(self, element: Element, points: Mapping[str, Any] | None = None) -> Any:
+        """Values [p] of an element at points (symbol name -> [p]), by default at the sample points."""
+        with np.errstate(all="ignore"):
+            return self._values(element.num, points) / self._values(element.den, points)
+
+    def _values(self, poly: PolyElement, points: Mapping[str, Any] | None = None) -> Any:
+        """Values [p] of a polynomial."""
+        total = np.zeros(np.shape(next(iter((points or self.samples).values()))))
         for monomial, coefficient in poly.terms():
             term = float(coefficient)
             for generator, exponent in zip(self.generators, monomial, strict=True):
                 if exponent:
-                    term = term * self._generator_values(generator) ** exponent
+                    term = term * self._generator_values(generator, points) ** exponent
             total = total + term
         return total
 
-    def _generator_values(self, generator: sp.Expr) -> Any:
-        if generator not in self._sampled:
-            with np.errstate(all="ignore"):
-                if generator in self.radicands:
-                    value = np.sqrt(self._values(self.radicands[generator]))
-                else:
-                    function = sp.lambdify([sp.Symbol(name) for name in self._samples], generator, "numpy")
-                    value = function(*self._samples.values())
-            self._sampled[generator] = value
-        return self._sampled[generator]
+    def _generator_values(self, generator: sp.Expr, points: Mapping[str, Any] | None) -> Any:
+        if points is None:
+            if generator not in self._sampled:
+                self._sampled[generator] = self._generator_values(generator, self.samples)
+            return self._sampled[generator]
+        with np.errstate(all="ignore"):
+            if generator in self.radicands:
+                return np.sqrt(self._values(self.radicands[generator], points))
+            if generator not in self._functions:
+                symbols = [sp.Symbol(name) for name in self.samples]
+                self._functions[generator] = sp.lambdify(symbols, generator, "numpy")
+            return self._functions[generator](*(points[name] for name in self.samples))
+
+    def check_length(self, *pairs: tuple[PolyElement, PolyElement]) -> None:
+        """Refuse products that would take long to multiply out."""
+        self.work += sum(len(a) * len(b) for a, b in pairs)
+        if self.work > WORK_LIMIT:
+            raise TooLong
 
     # -- normal form ---------------------------------------------------------------------------
 
@@ -235,7 +275,7 @@ class Algebra:
         if not den:
             raise ZeroDivisionError("division by zero in a mechanism's expressions")
         for index, square in self._squares:
-            even, odd = _split_parity(den, index)
+            even, odd = split_parity(den, index)
             if not odd or len(den) > CONJUGATE_LIMIT:
                 continue
             g = self.ring.gens[index]
@@ -243,7 +283,7 @@ class Algebra:
                 num, den = self._reduce(num * (even - g * odd)), self._reduce(even**2 - square * odd**2)
             else:
                 num, den = self._reduce(num * g), self._reduce(odd * square)
-        num, den = num.cancel(den) if len(num) * len(den) <= GCD_LIMIT else _cancel_content(num, den)
+        num, den = cancel(num, den)
         if den.LC < 0:
             num, den = -num, -den
         return Element(self, num, den)
@@ -251,12 +291,12 @@ class Algebra:
     def _reduce(self, poly: PolyElement) -> PolyElement:
         """Remainder that is linear in every sine and root."""
         for index, square in self._squares:
-            poly = _lower(poly, index, square)
+            poly = lower(poly, index, square)
         return poly
 
     def without_square(self, poly: PolyElement, cosine: PolyElement, sine: PolyElement) -> PolyElement:
         """Form of `poly` that is linear in the cosine and has powers of the sine instead."""
-        return _lower(poly, self.ring.index(cosine), 1 - sine**2)
+        return lower(poly, self.ring.index(cosine), 1 - sine**2)
 
     def convert(self, expression: sp.Expr) -> Element:
         """Element that a SymPy expression stands for."""
@@ -299,7 +339,7 @@ class Algebra:
         """(cos, sin) of a sum of multiples of angles, by the addition theorems."""
         cosine, sine = self.one, self.zero
         for term in sp.Add.make_args(sp.expand(argument)):
-            factor, core = term.as_coeff_Mul()
+            factor, core = _multiple(term)
             count = int(factor * self._units[core])
             c, s = (self.convert(f(core / self._units[core])) for f in (sp.cos, sp.sin))
             if count < 0:
@@ -308,7 +348,29 @@ class Algebra:
                 cosine, sine = cosine * c - sine * s, sine * c + cosine * s
         return cosine, sine
 
+    def primitive(self, field: Sequence[Element]) -> tuple[Element, list[Element]]:
+        """Function g and polynomial components N without common factor of a vector field X = g N."""
+        ring = self.ring
+        entries = [e for e in field if e]
+        den = ring.one
+        for e in entries:
+            den = den.lcm(e.den)
+        nums = [e.num * den.exquo(e.den) for e in entries]
+        gcd = ring.zero
+        for num in nums:
+            gcd = gcd.gcd(num)
+        rest = iter(nums)
+        return self.ratio(gcd, den), [Element(self, next(rest).exquo(gcd), ring.one) if e else self.zero for e in field]
+
     # -- calculus ------------------------------------------------------------------------------
+
+    def along(self, element: Element, direction: Iterable[tuple[sp.Symbol, Element]]) -> Element:
+        """Derivative of an element along sum_s w_s ∂_s, given as (symbol, weight) pairs."""
+        total = self.zero
+        for symbol, weight in direction:
+            if rate := self.diff(element, symbol):
+                total = total + weight * rate
+        return total
 
     def diff(self, element: Element, symbol: sp.Symbol) -> Element:
         """Partial derivative of an element with respect to a symbol."""
@@ -344,68 +406,23 @@ class Algebra:
         if g.is_Symbol or not g.args:
             return self.one if g == symbol else self.zero
         total = self.zero
-        for partial, argument in zip(_partials(g), g.args, strict=True):
+        for partial, argument in zip(partials(g), g.args, strict=True):
             total = total + self.convert(partial) * self.diff(self.convert(argument), symbol)
         return total
 
 
-def _partials(function: sp.Expr) -> tuple[sp.Expr, ...]:
+def _multiple(term: sp.Expr) -> tuple[sp.Rational, sp.Expr]:
+    """(factor, angle) of a term in the argument of a sine; a multiple that is long to expand is an angle itself."""
+    factor, core = term.as_coeff_Mul()
+    if factor.is_Rational and max(abs(factor.p), factor.q) <= MULTIPLES:
+        return factor, core
+    return (sp.S.NegativeOne, -term) if factor < 0 else (sp.S.One, term)
+
+
+def partials(function: sp.Expr) -> tuple[sp.Expr, ...]:
+    """Derivatives of f(args) with respect to each argument."""
+    if function.func in (sp.sin, sp.cos, sp.tan):
+        return (function.fdiff(),)
     if function.func not in _PARTIALS:
         raise ValueError(f"no derivative is known for {function}")
     return tuple(_PARTIALS[function.func](*function.args))
-
-
-def _cancel_content(num: PolyElement, den: PolyElement) -> tuple[PolyElement, PolyElement]:
-    """Cancel common integers and powers of generators, and the whole of den if it divides num."""
-    if not num:
-        return num, den.ring.one
-    if (quotient := exact_quotient(num, den)) is not None:
-        return quotient, den.ring.one
-    content = math.gcd(int(num.content()), int(den.content()))
-    monomial = tuple(map(min, zip(*num, *den, strict=True)))
-    return num.quo_term((monomial, ZZ(content))), den.quo_term((monomial, ZZ(content)))
-
-
-def exact_quotient(num: PolyElement, den: PolyElement) -> PolyElement | None:
-    """num/den if that is a polynomial, else None, usually at once: SymPy's `div` goes on to the remainder."""
-    ring = num.ring
-    if len(den) > len(num) or not all(map(ge, num.degrees(), den.degrees())):
-        return None
-    lead, lead_coefficient = den.LT
-    quotient, rest = ring.zero.copy(), num.copy()
-    while rest:
-        monomial, coefficient = rest.LT
-        if coefficient % lead_coefficient or not all(map(ge, monomial, lead)):
-            return None
-        step = tuple(map(sub, monomial, lead))
-        factor = coefficient // lead_coefficient
-        quotient[step] = factor
-        for m, c in den.items():
-            key = tuple(map(add, m, step))
-            if value := rest.get(key, 0) - factor * c:
-                rest[key] = value
-            else:
-                del rest[key]
-    return quotient
-
-
-def _lower(poly: PolyElement, index: int, square: PolyElement) -> PolyElement:
-    """Replace even powers of generator `index` by powers of `square`."""
-    if all(monomial[index] < 2 for monomial in poly):
-        return poly
-    parts: dict[int, PolyElement] = defaultdict(poly.ring.zero.copy)
-    for monomial, coefficient in poly.items():
-        half, odd = divmod(monomial[index], 2)
-        parts[half][(*monomial[:index], odd, *monomial[index + 1 :])] = coefficient
-    return sum((part * square**half for half, part in parts.items()), poly.ring.zero)
-
-
-def _split_parity(poly: PolyElement, index: int) -> tuple[PolyElement, PolyElement]:
-    """(A, B) of poly = A + g B, for poly at most linear in generator `index`."""
-    even, odd = poly.ring.zero.copy(), poly.ring.zero.copy()
-    for monomial, coefficient in poly.items():
-        if monomial[index]:
-            odd[(*monomial[:index], 0, *monomial[index + 1 :])] = coefficient
-        else:
-            even[monomial] = coefficient
-    return even, odd

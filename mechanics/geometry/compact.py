@@ -19,7 +19,8 @@ from typing import Any
 import sympy as sp
 from sympy.polys.rings import PolyElement
 
-from mechanics.geometry.algebra import Algebra, Element, exact_quotient
+from mechanics.geometry.algebra import Algebra, Element
+from mechanics.geometry.polynomials import exact_quotient, factor_list
 
 __all__ = ["Product", "Writer", "cost", "nested_sum"]
 
@@ -48,6 +49,11 @@ class Product:
         for base, exponent in other.factors.items():
             factors[base] = factors.get(base, 0) + exponent
         return Product(self.coefficient * other.coefficient, {b: e for b, e in factors.items() if e})
+
+    def power(self, exponent: Fraction) -> Product:
+        """Power of the product; a coefficient other than 1 takes integer exponents only."""
+        coefficient = self.coefficient ** int(exponent) if exponent.denominator == 1 else self.coefficient
+        return Product(coefficient, {base: e * exponent for base, e in self.factors.items()})
 
     def expression(self) -> sp.Expr:
         """SymPy expression of the product."""
@@ -102,7 +108,7 @@ class Writer:
         element = self.algebra.convert(node)
         if not element.is_polynomial or not element:
             return
-        content, factors = element.num.factor_list()
+        content, factors = factor_list(element.num)
         if len(factors) != 1 or factors[0][1] != 1 or abs(content) != 1 or factors[0][0] in self._forms:
             return
         if not named:
@@ -163,7 +169,7 @@ class Writer:
         if len(rest) > FACTOR_LIMIT:
             powers[rest] = powers.get(rest, 0) + 1
         elif len(rest) > 1:
-            factor_content, factors = rest.factor_list()
+            factor_content, factors = factor_list(rest)
             content *= factor_content
             for factor, power in factors:
                 powers[factor] = powers.get(factor, 0) + power

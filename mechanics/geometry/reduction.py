@@ -3,44 +3,42 @@
 With <<X, Y>> = X^T M Y the inertia tensor's inner product, D the velocities that the constraints
 allow and X_1..X_k an orthogonal frame of D, the motion q̇ = X_i v^i obeys
 
-    v̇^k = -Γ̃^k_ij v^i v^j - X_k(V)/|X_k|^2 + Y^k_a u_a,
+    v̇^k = -Γ̃^k_ij v^i v^j - X_k(V)/|X_k|^2 + Y^k_a u_a - R(X_k, X_j)/|X_k|^2 v^j,
     Γ̃^k_ij = <<∇_{X_i} X_j, X_k>>/|X_k|^2,    Y^k_a = F_a(X_k)/|X_k|^2,
 
-∇ the Levi-Civita connection of the inertia tensor. No multipliers, no inverse, no projection.
+∇ the Levi-Civita connection of the inertia tensor, R the second derivatives of Rayleigh's function
+where drag acts. No multipliers, no inverse, no projection.
 
 A vector field is held as X_i = g_i N_i with N_i polynomial and g_i a function. Since N_j and N_k are
 orthogonal, the derivative of g_j does not matter where j != k, and where j = k all that matters is
-the length: <<∇_X Y, Y>> = 1/2 X(|Y|^2). So only polynomials are multiplied, and divided once.
+the length: <<∇_X Y, Y>> = 1/2 X(|Y|^2). So only polynomials are multiplied, and divided once. Where
+they would become too long, the same derivation runs on an arithmetic that names its steps instead
+(`tape`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import reduce as reduce_product
-from operator import mul
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from mechanics.expressions import to_sympy
-from mechanics.geometry.algebra import Algebra, Element
+from mechanics.geometry.algebra import Algebra, TooLong
 from mechanics.geometry.compact import Product, Writer, nested_sum
+from mechanics.geometry.frames import null_frame, orthogonalise
 from mechanics.geometry.symmetry import planar_symmetry
+from mechanics.geometry.tape import Tape
 from mechanics.mechanism import Matrix, Mechanism
 
-__all__ = ["ReducedEquations", "reduce"]
+__all__ = ["ReducedEquations", "derive", "reduce"]
 
-Vector = list[Element]
-Terms = list[tuple[Element, ...]]  # a sum of products of elements, not multiplied out; empty for zero
-
-# Largest product of numbers of terms that is multiplied out to one fraction. No coefficient of the
-# mechanisms in the catalogue comes near; the frame of a three-link snake exceeds it, and its Γ̃ are
-# sums of fractions (in which a zero could hide).
-FOLD_LIMIT = 50_000
+Number = Any  # an element of the arithmetic at work: `Element` or `Value`
+Vector = list[Number]
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class ReducedEquations:
     Attributes:
         mechanism: what was reduced.
         coordinates: (n,) symbols q.
-        parameters: symbols of the parameters.
+        parameters: symbols of the parameters, and of the drag coefficients where drag acts.
         controls: (m,) symbols u.
         pseudo_velocities: (k,) symbols v1..vk.
         frame: (n, k) columns X_i(q) span D.
@@ -63,10 +61,13 @@ class ReducedEquations:
             symmetric in i, j (Theorem 3.2).
         input_coefficients: (k, m) Y^k_a = F_a(X_k)/|X_k|^2 (Theorem 3.2).
         potential_acceleration: (k,) -X_k(V)/|X_k|^2.
+        drag: (k, k) indexed [k, j]: R(X_k, X_j)/|X_k|^2, zero unless asked for.
         velocity: (n,) q̇ = X v.
-        acceleration: (k,) v̇ = -Γ̃ v v + Y u + potential_acceleration.
+        acceleration: (k,) v̇ = -Γ̃ v v + Y u + potential_acceleration - drag v.
         projection: (k, n) P with v = P q̇ for every q̇ in D; P = diag(1/|X|^2) X^T M.
         energy: kinetic and potential energy, in J.
+        definitions: pairs of a symbol and what it stands for in terms of symbols before it; the formulas
+            use them where they would explode otherwise. `reduce` writes them out.
     """
 
     mechanism: Mechanism
@@ -79,32 +80,73 @@ class ReducedEquations:
     christoffel: sp.ImmutableDenseNDimArray
     input_coefficients: sp.ImmutableMatrix
     potential_acceleration: sp.ImmutableDenseNDimArray
+    drag: sp.ImmutableMatrix
     velocity: sp.ImmutableDenseNDimArray
     acceleration: sp.ImmutableDenseNDimArray
     projection: sp.ImmutableMatrix
     energy: sp.Expr
+    definitions: tuple[tuple[sp.Symbol, sp.Expr], ...] = ()
+
+    def written_out(self) -> ReducedEquations:
+        """The same equations without definitions."""
+        if not self.definitions:
+            return self
+        meaning: dict[sp.Symbol, sp.Expr] = {}
+        for symbol, expression in self.definitions:
+            meaning[symbol] = expression.xreplace(meaning)
+
+        def close(value: Any) -> Any:
+            if isinstance(value, sp.Expr):
+                return value.xreplace(meaning)
+            return value.applyfunc(lambda e: e.xreplace(meaning))
+
+        formulas = {name: close(getattr(self, name)) for name in _FORMULAS}
+        return dataclasses.replace(self, **formulas, definitions=())
 
 
-def reduce(mechanism: Mechanism, frame: str | Sequence[Sequence[str]] | None = None) -> ReducedEquations:
+# The fields of `ReducedEquations` that are formulas.
+_FORMULAS = (
+    "frame", "squared_norms", "christoffel", "input_coefficients", "potential_acceleration", "drag", "velocity",
+    "acceleration", "projection", "energy",
+)  # fmt: skip
+
+
+def reduce(
+    mechanism: Mechanism, frame: str | Sequence[Sequence[str]] | None = None, *, drag: bool = False
+) -> ReducedEquations:
     """Derive the equations of motion of a mechanism by Theorem 3.2.
 
     Args:
         mechanism: inertia tensor, constraints, forces.
-        frame: name of one of the mechanism's frames, or k rows of n expressions (orthogonal vector
-            fields that span D), or None for the mechanism's default frame.
+        frame: name of one of the mechanism's frames, or k rows of n expressions (vector fields that
+            span D), or None for the mechanism's default frame, one found if it has none. Fields
+            that are not orthogonal are orthogonalised, row after row.
+        drag: whether the mechanism's drag acts.
 
     Returns:
         The reduced equations, in compact form.
     """
-    return _Reduction(mechanism, mechanism.frame_rows(frame)).equations()
+    return derive(mechanism, frame, drag=drag).written_out()
+
+
+def derive(
+    mechanism: Mechanism, frame: str | Sequence[Sequence[str]] | None = None, *, drag: bool = False
+) -> ReducedEquations:
+    """What `reduce` does, with the steps of a long derivation left as `definitions`: for generating code."""
+    rows = mechanism.frame_rows(frame)
+    try:
+        return _Reduction(mechanism, rows, drag, exact=True).equations()
+    except TooLong:
+        return _Reduction(mechanism, rows, drag, exact=False).equations()
 
 
 class _Reduction:
     """The derivation, one method a step."""
 
-    def __init__(self, mechanism: Mechanism, rows: Matrix) -> None:
+    def __init__(self, mechanism: Mechanism, rows: Matrix | None, drag: bool, exact: bool) -> None:
         self.mechanism = mechanism
-        n, k = mechanism.n, len(rows)
+        self.coefficients = tuple(mechanism.drag) if drag else ()
+        n, k = mechanism.n, mechanism.rank
         symbols = mechanism.symbols
         self.q = [symbols[name] for name in mechanism.coordinates]
         self.v = [sp.Symbol(f"v{i + 1}") for i in range(k)]
@@ -112,172 +154,155 @@ class _Reduction:
         self.symmetry = planar_symmetry(mechanism, rows)
 
         # Lemma 3.3: at the group identity the heading is gone before any algebra.
-        identity = dict.fromkeys(mechanism.fibre, sp.S.Zero) if self.symmetry else {}
-        scope = mechanism.scope(identity)
+        s = self.symmetry
+        scope = mechanism.scope({self.q[c].name: sp.S.Zero for c in (s.x, s.y, s.heading)} if s else {})
         definitions = [scope[name] for name in mechanism.definitions]
-        fields = [[to_sympy(text, scope) for text in row] for row in rows]
+        given = mechanism.one_forms if rows is None else rows
+        vectors = [[to_sympy(text, scope) for text in row] for row in given]
         inertia = [[to_sympy(text, scope) for text in row] for row in mechanism.inertia]
         forces = [[to_sympy(text, scope) for text in row] for row in mechanism.forces.values()]
         potential = to_sympy(mechanism.potential, scope)
-        everything = [*sum(fields, []), *sum(inertia, []), *sum(forces, []), potential]
-        algebra = self.algebra = Algebra([*definitions, *everything], _samples(mechanism))
-        self.writer = Writer(algebra, definitions, everything, self.q)
+        rayleigh = _rayleigh(mechanism, scope) if drag else []
+        everything = [*sum(vectors, []), *sum(inertia, []), *sum(forces, []), potential, *sum(rayleigh, [])]
+        algebra: Any
+        self.product: Callable[[Number], Product]
+        if exact:
+            algebra = Algebra([*definitions, *everything], _samples(mechanism))
+            self.product = Writer(algebra, definitions, everything, self.q).product
+            self.definitions: Callable[[], dict[sp.Symbol, sp.Expr]] = dict
+        else:
+            algebra = Tape(_samples(mechanism), frozenset(map(sp.Symbol, (*mechanism.parameters, *mechanism.drag))))
+            self.product, self.definitions = algebra.product, algebra.definitions
+        self.algebra = algebra
 
-        self.X = [[algebra.convert(e) for e in row] for row in fields]
         self.M = [[algebra.convert(e) for e in row] for row in inertia]
         self.F = [[algebra.convert(e) for e in row] for row in forces]
         self.V = algebra.convert(potential)
+        self.R = [[algebra.convert(e) for e in row] for row in rayleigh]
         self.half = algebra.convert(sp.S.Half)
-        self.scales, self.N = zip(*(_split_scale(row) for row in self.X), strict=True)
+        fields = [[algebra.convert(e) for e in row] for row in vectors]
+        if rows is None:
+            joints = [mechanism.coordinates.index(name) for name in mechanism.joint_limits]
+            fields = null_frame(algebra, fields, self.q, joints)
+        self.X = orthogonalise(fields, lambda a, b: self._form(self.M, a, b))
+        self.scales, self.N = zip(*map(algebra.primitive, self.X), strict=True)
         self.MN = [self._times_inertia(row) for row in self.N]
         self.norms = [self._dot(row, m) for row, m in zip(self.N, self.MN, strict=True)]  # |N_i|^2
         self.n, self.k = n, k
-        self.squared_norms = [self._fold([(g, g, s)]) for g, s in zip(self.scales, self.norms, strict=True)]
+        self.squared_norms = [g * g * s for g, s in zip(self.scales, self.norms, strict=True)]
+        self.directions = [self._direction(row) for row in self.N]
 
     # -- the pieces of Theorem 3.2 -------------------------------------------------------------
 
-    def christoffel(self) -> list[list[list[Terms]]]:
+    def christoffel(self) -> list[list[Vector]]:
         """Γ̃^k_ij as [k][i][j]."""
-        k, one = self.k, self.algebra.one
-        gamma: list[list[list[Terms]]] = [[[[] for _ in range(k)] for _ in range(k)] for _ in range(k)]
-        partials = [self._partials_of_field(row) for row in self.N]
-        inertia = self._partials_of_inertia()
+        k, one, g = self.k, self.algebra.one, self.scales
+        gamma = [[[self.algebra.zero] * k for _ in range(k)] for _ in range(k)]
+        inertia = [self._along_inertia(i) for i in range(k)]
         for i in range(k):
             for j in range(k):
-                gamma[j][i][j] = self._fold(self._stretch(i, j))
+                gamma[j][i][j] = self._stretch(i, j)
             for a in range(k):
                 for b in range(a):
                     # <<∇_X_i X_a, X_b>> = -<<X_a, ∇_X_i X_b>>, since the two fields are orthogonal
-                    value = self._covariant(i, a, b, partials[a], inertia)
-                    if value:
-                        g_i, g_a, g_b = (self.scales[index] for index in (i, a, b))
-                        gamma[b][i][a] = self._fold([(g_i, value, g_a, one / g_b, one / self.norms[b])])
-                        gamma[a][i][b] = self._fold([(g_i, -value, g_b, one / g_a, one / self.norms[a])])
+                    if value := self._covariant(i, a, b, inertia):
+                        gamma[b][i][a] = g[i] * value * g[a] * (one / g[b]) * (one / self.norms[b])
+                        gamma[a][i][b] = g[i] * -value * g[b] * (one / g[a]) * (one / self.norms[a])
         return gamma
 
-    def _stretch(self, i: int, j: int) -> Terms:
-        """<<∇_X_i X_j, X_j>>/|X_j|^2 = 1/2 X_i(log |X_j|^2), |X_j|^2 = g^2 |N_j|^2."""
-        ((squared_norm, *others),) = self.squared_norms[j]
-        if not others:
-            if rate := self._along(self.N[i], squared_norm):
-                return [(self.scales[i], self.half, rate, self.algebra.one / squared_norm)]
-            return []
-        terms: Terms = []
-        for factor, weight in ((self.norms[j], self.half), (self.scales[j], self.algebra.one)):
-            if rate := self._along(self.N[i], factor):
-                terms.append((self.scales[i], weight, rate, self.algebra.one / factor))
-        return terms
+    def _stretch(self, i: int, j: int) -> Number:
+        """<<∇_X_i X_j, X_j>>/|X_j|^2 = 1/2 X_i(log |X_j|^2)."""
+        rate = self._along(i, self.squared_norms[j])
+        return self.scales[i] * self.half * rate / self.squared_norms[j] if rate else rate
 
-    def _covariant(self, i: int, j: int, k: int, partials: list[Vector], inertia: list[list[Vector]]) -> Element:
-        """<<∇_N_i N_j, N_k>> = N_k^T M (DN_j N_i) + Γ_acd N_k^a N_i^c N_j^d."""
-        N, n = self.N, self.n
-        total = self.algebra.zero
-        for c in range(n):
-            if N[i][c] and any(partials[c]):
-                total = total + N[i][c] * self._dot(partials[c], self.MN[k])
+    def _covariant(self, i: int, j: int, k: int, inertia: list[list[Vector]]) -> Number:
+        """<<∇_N_i N_j, N_k>> = <<DN_j N_i, N_k>> + Γ_acd N_k^a N_i^c N_j^d."""
+        N = self.N
+        total = self._dot(self._along_field(i, N[j]), self.MN[k])
         # First-kind symbols 2 Γ_acd = ∂_c M_ad + ∂_d M_ac - ∂_a M_cd, contracted
-        second = self.algebra.zero
-        for c in range(n):
-            if any(any(row) for row in inertia[c]):
-                second = second + N[i][c] * self._form(inertia[c], N[k], N[j])
-                second = second + N[j][c] * self._form(inertia[c], N[k], N[i])
-                second = second - N[k][c] * self._form(inertia[c], N[i], N[j])
+        second = self._form(inertia[i], N[k], N[j]) + self._form(inertia[j], N[k], N[i])
+        second = second - self._form(inertia[k], N[i], N[j])
         return total + self.half * second if second else total
 
-    def inputs(self) -> list[list[Terms]]:
+    def inputs(self) -> list[Vector]:
         """Y^k_a = F_a(N_k)/(g_k |N_k|^2) as [k][a]."""
         return [[self._per_norm(k, self._dot(force, self.N[k])) for force in self.F] for k in range(self.k)]
 
-    def gradients(self) -> list[Terms]:
+    def gradients(self) -> Vector:
         """-X_k(V)/|X_k|^2."""
-        return [self._per_norm(k, -self._along(self.N[k], self.V)) for k in range(self.k)]
+        return [self._per_norm(k, -self._along(k, self.V)) for k in range(self.k)]
 
-    def projection(self) -> list[list[Terms]]:
+    def drag(self) -> list[Vector]:
+        """R(X_k, X_j)/|X_k|^2 as [k][j]; no rows without drag."""
+        columns = [[self._dot(row, field) for row in self.R] for field in self.X] if self.R else []
+        return [[self._per_norm(k, self._dot(self.N[k], column)) for column in columns] for k in range(self.k)]
+
+    def projection(self) -> list[Vector]:
         """X_k^T M/|X_k|^2."""
         return [[self._per_norm(k, m) for m in self.MN[k]] for k in range(self.k)]
 
-    def _per_norm(self, k: int, value: Element) -> Terms:
+    def _per_norm(self, k: int, value: Number) -> Number:
         """Divide `value`, which is linear in N_k, so that it counts per unit of |X_k|^2 for X_k in N_k's place."""
         one = self.algebra.one
-        return self._fold([(value, one / self.scales[k], one / self.norms[k])]) if value else []
-
-    def _fold(self, terms: Terms) -> Terms:
-        """A sum of products of elements as one element, which cancels, unless that would be very long."""
-        size = sum(math.prod(len(e.num) * len(e.den) for e in product) for product in terms)
-        if size > FOLD_LIMIT:
-            return terms
-        total = self.algebra.zero
-        for product in terms:
-            total = total + reduce_product(mul, product)
-        return [(total,)] if total else []
+        return value * (one / self.scales[k]) * (one / self.norms[k]) if value else value
 
     # -- calculus with the symmetry ------------------------------------------------------------
 
-    def _along(self, field: Sequence[Element], function: Element) -> Element:
-        """Derivative of a function along a vector field."""
-        total = self.algebra.zero
-        for component, rate in zip(field, self._rates([function], None), strict=True):
-            if component and rate[0]:
-                total = total + component * rate[0]
-        return total
+    def _along(self, i: int, function: Number) -> Number:
+        """Derivative of an invariant function along N_i."""
+        return self.algebra.along(function, self.directions[i])
 
-    def _partials_of_field(self, field: Sequence[Element]) -> list[Vector]:
-        """∂_c N as [c][a]."""
-        if not (s := self.symmetry):
-            return self._rates(field, None)
-        # ∂θ N = J N - ..., J maps e_x to e_y and e_y to -e_x
-        turned = [self.algebra.zero] * self.n
-        turned[s.x], turned[s.y] = -field[s.y], field[s.x]
-        return self._rates(field, turned)
+    def _direction(self, field: Vector) -> tuple[tuple[sp.Symbol, Number], ...]:
+        """What a field does to the coordinates that invariant functions see: pairs (coordinate, rate).
 
-    def _partials_of_inertia(self) -> list[list[Vector]]:
-        """∂_c M as [c][a][b]."""
-        n, flat = self.n, [e for row in self.M for e in row]
-        turned = None
-        if s := self.symmetry:
-            # ∂θ M = -J^T M - M J - ...; (M J)[:, x] = M[:, y] and (M J)[:, y] = -M[:, x]
-            MJ = [[self.algebra.zero] * n for _ in range(n)]
-            for a in range(n):
-                MJ[a][s.x], MJ[a][s.y] = self.M[a][s.y], -self.M[a][s.x]
-            turned = [-(MJ[a][b] + MJ[b][a]) for a in range(n) for b in range(n)]
-        return [[rates[a * n : (a + 1) * n] for a in range(n)] for rates in self._rates(flat, turned)]
-
-    def _rates(self, entries: Sequence[Element], turned: Vector | None) -> list[Vector]:
-        """Partial derivatives [c][entry] along every coordinate.
-
-        At the identity the fibre's derivatives come from the symmetry: an invariant tensor has no Lie
-        derivative along ∂x, ∂y and ∂θ + Σ ∂(turning) + x∂y - y∂x, so ∂θ = `turned` - Σ ∂(turning).
+        At the identity the fibre's derivatives come from the symmetry: an invariant function has no
+        derivative along ∂x, ∂y and ∂θ + Σ ∂(turning) + x∂y - y∂x, so ∂θ = -Σ ∂(turning).
         """
-        rates = [[self.algebra.diff(e, symbol) for e in entries] for symbol in self.q]
+        rates = dict(zip(self.q, field, strict=True))
         if s := self.symmetry:
-            rates[s.heading] = list(turned) if turned else [self.algebra.zero] * len(entries)
             for c in s.turning:
-                rates[s.heading] = [a - b if b else a for a, b in zip(rates[s.heading], rates[c], strict=True)]
+                rates[self.q[c]] = rates[self.q[c]] - field[s.heading]
+            for c in (s.x, s.y, s.heading):
+                del rates[self.q[c]]
+        return tuple((symbol, rate) for symbol, rate in rates.items() if rate)
+
+    def _along_field(self, i: int, field: Vector) -> Vector:
+        """DN N_i, the components' derivatives along N_i: those of an invariant field also turn with the heading."""
+        rates = [self._along(i, e) if e else e for e in field]
+        if (s := self.symmetry) and (turn := self.N[i][s.heading]):
+            rates[s.x], rates[s.y] = rates[s.x] - turn * field[s.y], rates[s.y] + turn * field[s.x]
+        return rates
+
+    def _along_inertia(self, i: int) -> list[Vector]:
+        """Derivatives of M's entries along N_i, likewise: ∂θ M = J M - M J with J: e_x -> e_y -> -e_x."""
+        rates = [[self._along(i, e) if e else e for e in row] for row in self.M]
+        if (s := self.symmetry) and (turn := self.N[i][s.heading]):
+            for a in range(self.n):
+                for c, entry in ((s.x, self.M[a][s.y]), (s.y, -self.M[a][s.x])):
+                    rates[a][c] = rates[a][c] - turn * entry
+                    rates[c][a] = rates[c][a] - turn * entry
         return rates
 
     # -- linear algebra ------------------------------------------------------------------------
 
-    def _dot(self, a: Sequence[Element], b: Sequence[Element]) -> Element:
+    def _dot(self, a: Vector, b: Vector) -> Number:
         total = self.algebra.zero
         for left, right in zip(a, b, strict=True):
             if left and right:
                 total = total + left * right
         return total
 
-    def _times_inertia(self, field: Sequence[Element]) -> Vector:
+    def _times_inertia(self, field: Vector) -> Vector:
         return [self._dot(row, field) for row in self.M]
 
-    def _form(self, matrix: Sequence[Sequence[Element]], a: Sequence[Element], b: Sequence[Element]) -> Element:
+    def _form(self, matrix: list[Vector], a: Vector, b: Vector) -> Number:
         return self._dot(a, [self._dot(row, b) for row in matrix])
 
     # -- writing -------------------------------------------------------------------------------
 
-    def _products(self, terms: Terms) -> list[Product]:
-        return [reduce_product(mul, map(self.writer.product, elements)) for elements in terms]
-
-    def _turn(self, entries: Sequence[Terms]) -> list[list[Product]]:
+    def _turn(self, entries: Vector) -> list[list[Product]]:
         """Components in the plane's axes of components in the body's axes."""
-        rows = [self._products(e) for e in entries]
+        rows = [[self.product(e)] if e else [] for e in entries]
         if s := self.symmetry:
             cosine, sine = (Product(factors={f(self.q[s.heading]): Fraction(1)}) for f in (sp.cos, sp.sin))
             minus = Product(Fraction(-1))
@@ -286,8 +311,8 @@ class _Reduction:
             rows[s.y] = [sine * p for p in px] + [cosine * p for p in py]
         return rows
 
-    def _write(self, terms: Terms) -> sp.Expr:
-        return self._sum(self._products(terms))
+    def _write(self, value: Number) -> sp.Expr:
+        return self._sum([self.product(value)])
 
     def _sum(self, terms: Sequence[Product]) -> sp.Expr:
         return self._away_from_identity(nested_sum(terms, [*self.q, *self.v, *self.u]))
@@ -301,10 +326,9 @@ class _Reduction:
 
     def equations(self) -> ReducedEquations:
         """All of it, written compactly."""
-        k, write, minus = self.k, self._write, Product(Fraction(-1))
-        norms = sp.ImmutableDenseNDimArray([write(terms) for terms in self.squared_norms])
-        gamma, Y, gradients = self.christoffel(), self.inputs(), self.gradients()
-        fields = [self._turn([[(e,)] if e else [] for e in row]) for row in self.X]
+        k, write, product, minus = self.k, self._write, self.product, Product(Fraction(-1))
+        gamma, Y, gradients, drag = self.christoffel(), self.inputs(), self.gradients(), self.drag()
+        fields = [self._turn(row) for row in self.X]
         covectors = [self._turn(row) for row in self.projection()]
         v, u = ([Product(factors={s: Fraction(1)}) for s in symbols] for symbols in (self.v, self.u))
 
@@ -312,56 +336,49 @@ class _Reduction:
             terms = []
             for i in range(k):
                 for j in range(i + 1):
-                    both = gamma[up][i][j] if i == j else self._fold(gamma[up][i][j] + gamma[up][j][i])
-                    terms += [minus * p * v[j] * v[i] for p in self._products(both)]
-            terms += [p * u[a] for a in range(len(u)) for p in self._products(Y[up][a])]
-            return self._sum(terms + self._products(gradients[up]))
+                    both = gamma[up][i][j] if i == j else gamma[up][i][j] + gamma[up][j][i]
+                    terms.append(minus * product(both) * v[j] * v[i])
+            terms += [product(Y[up][a]) * u[a] for a in range(len(u))]
+            terms += [minus * product(entry) * v[j] for j, entry in enumerate(drag[up])]
+            return self._sum([*terms, product(gradients[up])])
 
-        kinetic = [
-            Product(Fraction(1, 2)) * p * w * w
-            for terms, w in zip(self.squared_norms, v, strict=True)
-            for p in self._products(terms)
-        ]
-        return ReducedEquations(
+        kinetic = [Product(Fraction(1, 2)) * product(s) * w * w for s, w in zip(self.squared_norms, v, strict=True)]
+        equations = ReducedEquations(
             mechanism=self.mechanism,
             coordinates=tuple(self.q),
-            parameters=tuple(sp.Symbol(name) for name in self.mechanism.parameters),
+            parameters=tuple(sp.Symbol(name) for name in (*self.mechanism.parameters, *self.coefficients)),
             controls=tuple(self.u),
             pseudo_velocities=tuple(self.v),
             frame=sp.ImmutableMatrix([[self._sum(field[a]) for field in fields] for a in range(self.n)]),
-            squared_norms=norms,
+            squared_norms=sp.ImmutableDenseNDimArray([write(e) for e in self.squared_norms]),
             christoffel=sp.ImmutableDenseNDimArray([[[write(e) for e in row] for row in plane] for plane in gamma]),
             input_coefficients=sp.ImmutableMatrix(k, len(u), [write(e) for row in Y for e in row]),
             potential_acceleration=sp.ImmutableDenseNDimArray([write(e) for e in gradients]),
+            drag=sp.ImmutableMatrix([[write(e) for e in row] for row in drag])
+            if self.R
+            else sp.zeros(k).as_immutable(),
             velocity=sp.ImmutableDenseNDimArray(
                 [self._sum([t * v[i] for i in range(k) for t in fields[i][a]]) for a in range(self.n)]
             ),
             acceleration=sp.ImmutableDenseNDimArray([acceleration(up) for up in range(k)]),
             projection=sp.ImmutableMatrix([[self._sum(terms) for terms in row] for row in covectors]),
-            energy=self._sum([*kinetic, self.writer.product(self.V)]),
+            energy=self._sum([*kinetic, product(self.V)]),
         )
+        steps = {step: self._away_from_identity(e) for step, e in self.definitions().items()}
+        return dataclasses.replace(equations, definitions=tuple(steps.items()))
 
 
-def _split_scale(field: Sequence[Element]) -> tuple[Element, Vector]:
-    """Function g and polynomial components N without common factor, X = g N."""
-    algebra = field[0].algebra
-    ring = algebra.ring
-    entries = [e for e in field if e]
-    den = ring.one
-    for e in entries:
-        den = den.lcm(e.den)
-    nums = [e.num * den.exquo(e.den) for e in entries]
-    gcd = ring.zero
-    for num in nums:
-        gcd = gcd.gcd(num)
-    scale = algebra.ratio(gcd, den)
-    numerators = iter(nums)
-    return scale, [Element(algebra, next(numerators).exquo(gcd), ring.one) if e else algebra.zero for e in field]
+def _rayleigh(mechanism: Mechanism, scope: Mapping[str, sp.Expr]) -> list[list[sp.Expr]]:
+    """[n][n] second derivatives of Rayleigh's function in the rates."""
+    rates = [sp.Symbol(name) for name in mechanism.rates]
+    function = to_sympy(mechanism.rayleigh, {**scope, **{rate.name: rate for rate in rates}})
+    return [[sp.diff(function, a, b) for b in rates] for a in rates]
 
 
 def _samples(mechanism: Mechanism) -> dict[str, Any]:
     """Values at random points of the whole configuration space, to see which factors are positive."""
     rng = np.random.default_rng(3)
     count = 200
-    values = {name: value * rng.uniform(0.9, 1.1, count) for name, value in mechanism.parameters.items()}
+    numbers = {**mechanism.parameters, **mechanism.drag}
+    values = {name: value * rng.uniform(0.9, 1.1, count) for name, value in numbers.items()}
     return values | {name: rng.uniform(-np.pi, np.pi, count) for name in mechanism.coordinates}
