@@ -9,19 +9,38 @@ from mechanics.mechanism import Mechanism, MechanismError
 
 __all__ = ["get", "names"]
 
-_NAMES = (
+# Those with a pose in the plane and controls, which have environments. Said here, because asking the mechanisms
+# would build all of them with every `import nhenv`, ten milliseconds each.
+_IN_THE_PLANE = (
     "snakeboard",
     "roller_racer",
+    "chaplygin_sleigh",
+    "chaplygin_beanie",
+    "sleigh_with_arm",
+    "knife_edge_incline",
+    "vertical_rolling_disk",
+    "differential_drive",
+    "car",
+    "trailer",
+    "snake",
+    "roller_racer_massive",
+    "planar_rigid_body",
+    "falling_rolling_disk",
+    "wheeled_inverted_pendulum",
+)
+_OTHERS = (
+    "suslov",
+    "chaplygin_sphere",
 )
 
 
-def names() -> tuple[str, ...]:
-    """Names of the mechanisms in the catalogue."""
-    return _NAMES
+def names(*, in_the_plane: bool = False) -> tuple[str, ...]:
+    """Names of the mechanisms in the catalogue, or only of those that can be steered through the plane."""
+    return _IN_THE_PLANE if in_the_plane else (*_IN_THE_PLANE, *_OTHERS)
 
 
 def get(name: str) -> Mechanism:
     """Mechanism of this name; raise `MechanismError` with the known names if there is none."""
-    if name not in _NAMES:
-        raise MechanismError(unknown_name("mechanism", str(name), _NAMES))
+    if name not in names():
+        raise MechanismError(unknown_name("mechanism", str(name), names()))
     return getattr(importlib.import_module(f"mechanics.catalog.{name}"), name)

@@ -57,6 +57,10 @@ roller_racer = Mechanism(
     fibre=("x", "y", "theta"),
     joint_limits={"psi": 1.2},
     torque_limits={"u_psi": 0.4},
+    # Rolling at the wheels of the body and of the front link, friction in the joint.
+    rayleigh="(C*(cos(theta)*x_dot + sin(theta)*y_dot)**2"
+    " + C*(cos(theta + psi)*x_dot + sin(theta + psi)*y_dot + l_1*sin(psi)*theta_dot)**2 + b_psi*psi_dot**2)/2",
+    drag={"C": 0.3, "b_psi": 0.02},
     observation={"psi": "psi/1.2", "psi_dot": "psi_dot/10", "speed": "speed"},
     # A heavy body with a light front link is driven away from that link.
     forward="l_1*I_2 - l_2*I_1",

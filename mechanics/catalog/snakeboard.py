@@ -57,5 +57,9 @@ snakeboard = Mechanism(
     fibre=("x", "y", "theta"),
     joint_limits={"phi": 1.2},
     torque_limits={"u_psi": 1.0, "u_phi": 0.5},
+    # Rolling at the wheels, which all have the same speed, that of the front ones; friction in both joints.
+    rayleigh="(C*(cos(theta - phi)*x_dot + sin(theta - phi)*y_dot - l*sin(phi)*theta_dot)**2"
+    " + b_psi*psi_dot**2 + b_phi*phi_dot**2)/2",
+    drag={"C": 1.2, "b_psi": 0.05, "b_phi": 0.02},
     observation={"phi": "phi/1.2", "phi_dot": "phi_dot/10", "psi_dot": "psi_dot/10", "speed": "speed"},
 )
