@@ -22,8 +22,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-import nhenv
-
 __all__ = ["main"]
 
 PROGRAM = """
@@ -38,6 +36,8 @@ env.step(env.action_space.sample())
 class Arguments:
     """Size of the benchmark."""
 
+    env_ids: tuple[str, ...] = ("nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0")
+    """environments"""
     cold: int = 3
     """processes with an empty cache"""
     warm: int = 10
@@ -48,7 +48,7 @@ def main(arguments: Arguments) -> None:
     """Print seconds to the first step."""
     table = Table("environment", "cache", "seconds", caption="to the first step: medians and quartiles")
     jobs: list[tuple[str, str, int]] = [
-        (env_id, cache, getattr(arguments, cache)) for env_id in nhenv.environment_ids() for cache in ("cold", "warm")
+        (env_id, cache, getattr(arguments, cache)) for env_id in arguments.env_ids for cache in ("cold", "warm")
     ]
     jobs.append(("CartPole-v1", "-", arguments.warm))
     for env_id, cache, runs in track(jobs, "environments", console=Console(stderr=True)):

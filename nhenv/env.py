@@ -12,30 +12,34 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-import mechanics
 from mechanics.expressions import evaluate, unknown_name
-from mechanics.mechanism import Mechanism
 from mechanics.model import Model
 from nhenv import tasks
+from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
 from nhenv.replay import Replay
-from nhenv.scene import BAD_ACTION, HISTORY_FULL, Scene
+from nhenv.scene import BAD_ACTION, HISTORY_FULL, TERMINATED, Scene
 
 __all__ = ["LocomotionEnv"]
 
 Array = NDArray[np.float64]
 Response = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]
+Options = Mapping[str, Any]
 
 
 class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """A mechanism that rolls without slipping, driven by torques on its joints.
+    """A mechanism that rolls without slipping, driven by forces and torques.
 
     ## Description
     Each step holds the torques for `dt` seconds and integrates the reduced equations of Bullo and
     Zefran, q̇ = X(q) v and v̇ = -Γ̃(q) v v + Y(q) u, which satisfy the rolling constraints by
-    construction. The mechanism has no drive at its wheels: it moves by steering and swinging.
+    construction. Where a mechanism has no drive at its wheels, it moves by steering and swinging.
+
+    Ids are nhenv/MECHANISM TASK-v0, such as nhenv/RollerRacerGoal-v0: `nhenv.environment_ids()` lists
+    them, `nhenv.register(mechanism)` adds those of a mechanism of your own.
 
     ## Action space
-    `Box(-1, 1, (m,), float32)`: torque over its limit, clipped, held over the step.
+    `Box(-1, 1, (m,), float32)`: each control of the mechanism, in its order, over its limit; clipped,
+    held over the step. A control without a declared limit has 1.0.
 
     | mechanism | index | action | control | limit |
     |---|---|---|---|---|
@@ -43,8 +47,11 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | | 1 | torque on the steering | `u_phi` | 0.5 N m |
     | roller racer | 0 | torque on the joint | `u_psi` | 0.4 N m |
 
+    `env.unwrapped.mechanism.controls` and `.torque_limits` are those of any other.
+
     ## Observation space
-    `Box(-inf, inf, (d,), float32)`. Position, the rotor's angle and time are not observed.
+    `Box(-inf, inf, (d,), float32)`: what the mechanism declares, then what the task adds. Position, the
+    snakeboard's rotor angle and time are not observed.
 
     | mechanism | index | observation | unit |
     |---|---|---|---|
@@ -55,28 +62,63 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | roller racer | 0 | joint angle `psi` | 1.2 rad |
     | | 1 | its rate | 10 rad/s |
     | | 2 | speed along the heading | m/s |
-    | both, Forward | last two | cosine and sine of the heading `theta` | |
+
+    | task | added observations | unit |
+    |---|---|---|
+    | Forward | cosine and sine of the heading | |
+    | Velocity | cosine and sine of the heading; commanded speed | 1, 1; m/s |
+    | Goal | direction of the goal, ahead and to the left (a unit vector in the body's axes); its distance | 1, 1; 2 m |
+
+    A mechanism that declares no observation shows, in SI units: each shape coordinate that anything
+    depends on (over its stop if it has one, as cosine and sine if a full turn changes nothing, else its
+    value), the rates of all shape coordinates, and speed along the heading, drift across it and
+    turning rate as far as the constraints allow them. `env.unwrapped.observation_labels` names the elements.
+
+    ## Targets
+    Drawn at reset after the starting state, from the same generator; returned in the `info` of `reset`
+    and as `env.unwrapped.targets`. `reset(options={"target": {...}})` replaces any of them by name.
+
+    | task | target | drawn |
+    |---|---|---|
+    | Velocity | `commanded_speed` | uniform in 0.2 to 1 m/s |
+    | Goal | `goal_x`, `goal_y` | from the origin, `start_distance` uniform in 1 to 3 m, `start_bearing` in ±π |
 
     ## Rewards
-    Forward: `reward_forward + reward_ctrl`, both reported in `info`, with
-    `reward_forward = forward_reward_weight * s * (x - x_before) / dt` and
-    `reward_ctrl = -ctrl_cost_weight * mean(action**2)`. s is the mechanism's own forward: +1 for
-    the snakeboard, the sign of l_1 I_2 - l_2 I_1 for the roller racer (-1 by default: a heavy body
-    is driven away from its light front link). `info` also has `x_position` and `x_velocity`.
+    A sum of terms, all reported in `info`. s is the mechanism's own forward: +1 for the snakeboard, the
+    sign of l_1 I_2 - l_2 I_1 for the roller racer (-1 by default: a heavy body is driven away from its
+    light front link). d is the distance to the goal.
+
+    | task | term | value |
+    |---|---|---|
+    | Forward | `reward_forward` | `forward_reward_weight * s * (x - x_before) / dt` |
+    | Velocity | `reward_velocity` | `1 - velocity_cost_weight * abs(s * x_dot - commanded_speed)` |
+    | | `reward_sideways` | `-sideways_cost_weight * abs(y_dot)` |
+    | Goal | `reward_progress` | `progress_reward_weight * (d_before - d) / dt` |
+    | | `reward_time` | `-time_cost_weight` |
+    | | `reward_goal` | `goal_reward_weight` on the step that reaches the goal, else 0 |
+    | all | `reward_ctrl` | `-ctrl_cost_weight * mean(action**2)` |
+
+    `info` also has, for Forward, `x_position` and `x_velocity`, the mean over the step; for Velocity,
+    `x_velocity` and `y_velocity` at its end; for Goal, `x_position`, `y_position`, `goal_distance` d, and
+    `is_success`, 1.0 on the step that reaches the goal, else 0.0.
+
+    Velocity asks for the velocity (s * commanded_speed, 0) in the plane, at the end of each step: along
+    the x axis, not along the heading, the way in which the gaits drive the mechanism.
 
     ## Starting state
-    At rest at the origin, each joint with stops uniform in ± `reset_noise_scale`. Or as given:
-    `reset(options={"q": ..., "qdot": ...})`, coordinates and velocities in the order of
-    `env.unwrapped.mechanism.coordinates`; a velocity must satisfy the rolling constraints.
+    At rest at the origin, each joint with stops uniform in ± `reset_noise_scale`, or the heading if
+    there is none. Or as given: `reset(options={"q": ..., "qdot": ...})`, coordinates and velocities in
+    the order of `env.unwrapped.mechanism.coordinates`; a velocity must satisfy the rolling constraints.
 
     ## Episode end
-    Truncated after 300 steps (by the TimeLimit that `gym.make` adds). Terminated only if the state
-    stops being finite: then `info["diverged"]` is True and the last finite observation is returned.
+    Truncated after 300 steps (by the TimeLimit that `gym.make` adds). Terminated in Goal with the step
+    after which d < `goal_radius`; in every task if the state stops being finite: then
+    `info["diverged"]` is True and the last finite observation is returned.
 
     ## Arguments
     Args:
-        mechanism: a `Mechanism`, or the name of one in the catalogue.
-        task: a `Task`, or the name of one.
+        mechanism: a `Mechanism`, the name of one in the catalogue, its plain data or the path of its file.
+        task: a `Task`, the name of one, or its plain data.
         params: values that replace the mechanism's default parameters, by name.
         dt: control period in s.
         torque_limits: largest torques in N m: by name, or one for each control.
@@ -84,9 +126,13 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         frame: frame in which the equations are integrated; None for the one that computes best.
         integrator: "auto", or a method of `mechanics.compiler.integrators`.
         substeps: steps of the method in a control period; None for the default.
-        reset_noise_scale: half-width of the joints' initial angles, in rad.
+        reset_noise_scale: half-width of the initial angles, in rad.
+        backend: "numba", or "numpy" for kernels that are interpreted: nothing is compiled, each step
+            takes some fifty times as long, and a debugger can walk through it.
         render_mode: None; these environments do not draw.
-        **weights: the task's weights: `forward_reward_weight=1.0`, `ctrl_cost_weight=0.02`.
+        **weights: the task's weights. Forward: `forward_reward_weight=1.0`. Velocity: `velocity_cost_weight=2.0`,
+            `sideways_cost_weight=0.2`. Goal: `progress_reward_weight=1.0`, `time_cost_weight=0.5`,
+            `goal_reward_weight=5.0`, `goal_radius=0.15`. All: `ctrl_cost_weight=0.02`.
 
     ## Version history
     * v0: initial version.
@@ -96,8 +142,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __init__(
         self,
-        mechanism: str | Mechanism,
-        task: str | tasks.Task = "Forward",
+        mechanism: MechanismLike,
+        task: TaskLike = "Forward",
         *,
         params: Mapping[str, float] | None = None,
         dt: float = 0.05,
@@ -107,6 +153,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         integrator: str = "auto",
         substeps: int | None = None,
         reset_noise_scale: float = 0.05,
+        backend: str = "numba",
         render_mode: str | None = None,
         **weights: float,
     ) -> None:
@@ -114,8 +161,10 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(f"render_mode must be None, got {render_mode!r}: these environments do not draw")
         if substeps is not None and (isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1):
             raise ValueError(f"substeps must be a positive whole number or None, got {substeps!r}")
-        self.mechanism = mechanics.get(mechanism) if isinstance(mechanism, str) else mechanism
-        self.task = tasks.get(task) if isinstance(task, str) else task
+        self.mechanism = in_the_plane(as_mechanism(mechanism))
+        self.task = tasks.get(task)
+        if problem := unfit(self.mechanism, self.task):
+            raise ValueError(problem)
         self.params = self.mechanism.resolve(params)
         self.dt = _positive("dt", dt)
         self.torque_limits = self._torque_limits(torque_limits)
@@ -129,6 +178,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             stops=bool(self.joint_limits),
             integrator=integrator,
             substeps=substeps,
+            backend=backend,
         )
         self._numbers = self._kernel_parameters(weights)
         kernel = self._scene.kernel
@@ -136,36 +186,36 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (len(kernel.OBSERVATION),), np.float32)
         self._blank = self._memory = self._new_memory(self._scene)
         self._start: tuple[Array, Array] | None = None  # (q, v) at reset
+        self._targets: dict[str, float] = {}
         self._replay: Replay | None = None
         self._bind()
 
     # -- Gymnasium -----------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | None = None, options: Mapping[str, ArrayLike] | None = None
+        self, *, seed: int | None = None, options: Options | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode at rest near the origin, or at `options` "q" and "qdot"."""
+        """Start an episode at rest near the origin, or at `options` "q" and "qdot", for the `options` "target"."""
         super().reset(seed=seed)
         for key in options or {}:
-            if key not in ("q", "qdot"):
-                raise ValueError(f"reset options: {unknown_name('option', str(key), ('q', 'qdot'))}")
+            if key not in ("q", "qdot", "target"):
+                raise ValueError(f"reset options: {unknown_name('option', str(key), ('q', 'qdot', 'target'))}")
         q = np.zeros(self.mechanism.n)
-        noise = self.np_random.uniform(
-            -self.reset_noise_scale, self.reset_noise_scale, len(self.mechanism.joint_limits)
-        )
-        for joint, angle in zip(self.mechanism.joint_limits, noise, strict=True):
-            q[self.mechanism.coordinates.index(joint)] = angle
+        q[self._noisy] = self.np_random.uniform(-self.reset_noise_scale, self.reset_noise_scale, len(self._noisy))
         v = np.zeros(self.mechanism.rank)
+        targets = self.task.draw(self.np_random, self._given_targets(options) if options else {})
         if options:
             q = self._given(options, "q", q)
             self._check_stops(q)
             if "qdot" in options:
                 v = self._model.feasible(q, self._given(options, "qdot", np.zeros_like(q)))
         self._memory, self._start = self._blank.copy(), (q, v)
+        self._targets = {name: targets[name] for name in self._scene.targets}
         self._scene.put(self._memory, q, v)
+        self._scene.aim(self._memory, self._targets)
         self._replay = None
         self._bind()
-        return self._observation(), {}
+        return self._observation(), dict(self._targets)
 
     def step(self, action: NDArray[Any]) -> Response:
         """Hold the torques `action * torque_limits` for `dt` seconds."""
@@ -176,6 +226,17 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._exception(response, action) if response[2] else response
 
     # -- state ---------------------------------------------------------------------------------
+
+    @property
+    def targets(self) -> dict[str, float]:
+        """The task's targets in this episode, by name: those that something depends on."""
+        self._started()
+        return dict(self._targets)
+
+    @property
+    def observation_labels(self) -> tuple[str, ...]:
+        """Name of each element of the observation."""
+        return self._scene.kernel.OBSERVATION
 
     @property
     def q(self) -> Array:
@@ -203,13 +264,16 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _whole_state(self) -> tuple[Array, Array]:
         """(q, v), with what the scene prunes worked out from what happened since reset."""
-        if self._start is None:
-            raise ResetNeeded("the environment has no state before reset(); call reset() first")
+        self._started()
         values = self._scene.values(self._memory)
         if self._scene.kernel.PRUNED:
             values = self._followed().values(self._memory) | values
         state = np.array([values[name] for name in self._scene.states])
         return state[: self.mechanism.n], state[self.mechanism.n :]
+
+    def _started(self) -> None:
+        if self._start is None:
+            raise ResetNeeded("the environment has no state before reset(); call reset() first")
 
     def _followed(self) -> Replay:
         """The replay of this episode, begun when first asked for."""
@@ -246,7 +310,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         kernel = self._scene.kernel
         state = self._memory[slice(*kernel.MEMORY["state"])].tolist()
         observe = getattr(kernel.observe, "py_func", kernel.observe)  # compiling it alone would take longer
-        return np.array(observe(*state, self._memory[slice(*kernel.MEMORY["k"])]), dtype=np.float32)
+        constants = self._memory[slice(*kernel.MEMORY["k"])]
+        return np.array(observe(*state, *self._targets.values(), constants), dtype=np.float32)
 
     def _as_action(self, action: ArrayLike) -> Array:
         shape, controls = self.action_space.shape, ", ".join(self.mechanism.controls)
@@ -268,10 +333,18 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if status == HISTORY_FULL:  # nothing was done: make room and do it
             self._followed().make_room(self._memory)
             return self.step(action)
+        if status == TERMINATED:
+            return observation, reward, True, False, info
         info["diverged"] = True
         return observation, reward, True, False, info
 
     # -- arguments -----------------------------------------------------------------------------
+
+    @cached_property
+    def _noisy(self) -> list[int]:
+        """Coordinates that are random at reset: the joints with stops, or else the heading."""
+        names = tuple(self.mechanism.joint_limits) or self.mechanism.fibre[2:]
+        return [self.mechanism.coordinates.index(name) for name in names]
 
     def _kernel_parameters(self, weights: Mapping[str, float]) -> dict[str, float]:
         values = dict(self.task.weights)
@@ -322,7 +395,20 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(f"reset_noise_scale must be at least 0 and below the stops at {smallest} rad, got {scale}")
         return number
 
-    def _given(self, options: Mapping[str, ArrayLike], key: str, default: Array) -> Array:
+    def _given_targets(self, options: Options) -> dict[str, float]:
+        given = options.get("target", {})
+        if not isinstance(given, Mapping):
+            raise ValueError(f"reset option 'target' must map targets to numbers, got {given!r}")
+        values = {}
+        for name, value in given.items():
+            if name not in self.task.targets:
+                raise ValueError(f"reset option 'target': {unknown_name('target', str(name), self.task.targets)}")
+            values[name] = _number(f"reset option 'target': {name}", value)
+            if not math.isfinite(values[name]):
+                raise ValueError(f"reset option 'target': {name} must be finite, got {value}")
+        return values
+
+    def _given(self, options: Options, key: str, default: Array) -> Array:
         values = np.array(options.get(key, default), dtype=float)
         names = ", ".join(self.mechanism.coordinates)
         if values.shape != default.shape:

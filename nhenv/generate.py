@@ -16,9 +16,11 @@ from mechanics.compiler.codegen import BACKENDS, Program, operation_count
 from mechanics.compiler.dataflow import Dataflow, analyse, initial
 from mechanics.compiler.integrators import Method, method
 from mechanics.expressions import ExpressionError, to_sympy
-from mechanics.geometry.reduction import ReducedEquations, reduce
+from mechanics.geometry.reduction import ReducedEquations, derive
 from mechanics.geometry.symmetry import planar_symmetry
-from nhenv.scene import BAD_ACTION, DIVERGED, HISTORY_FULL, RUNNING, Scene
+from nhenv.observation import default_observation
+from nhenv.scene import BAD_ACTION, DIVERGED, HISTORY_FULL, RUNNING, TERMINATED, Scene
+from nhenv.tasks import Task
 
 __all__ = ["kernel_source"]
 
@@ -30,10 +32,12 @@ CORE = ("dop853", 2)
 # Holds remembered when a state is pruned, so that `env.q` can still be worked out when asked for.
 HISTORY = 512
 
+TERMINATED_NOW = sp.Symbol("_terminated")  # 1 if the task ends the episode with this step, else 0
+
 
 def kernel_source(scene: Scene) -> str:
     """Source of a scene's kernel module."""
-    return _Generator(scene, reduce(scene.mechanism, scene.frame)).module()
+    return _Generator(scene, derive(scene.mechanism, scene.frame)).module()
 
 
 class _Generator:
@@ -45,35 +49,63 @@ class _Generator:
         self.actions = [sp.Symbol(f"_a_{control}") for control in scene.mechanism.controls]
         self.joints = [_joint(equations, name) for name in scene.joints]
         self.free = [sp.Symbol(f"_free_{angle.name}") for angle, _ in self.joints]
-        observation, judgement = self._task_expressions()
+        observation, judgement, ending = self._task_expressions()
         velocities = dict(zip(equations.coordinates, equations.velocity, strict=True))
         accelerations = dict(zip(equations.pseudo_velocities, equations.acceleration, strict=True))
         held = {rate: free for (_, rate), free in zip(self.joints, self.free, strict=True)}
         rates = {**velocities, **{v: rate * held.get(v, 1) for v, rate in accelerations.items()}}
-        self.flow = analyse(rates, self._wanted(rates, [*observation.values(), *judgement.values()]))
+        wanted = self._wanted(rates, [*observation.values(), *judgement.values(), *ending.values()])
+        self.flow = analyse(rates, wanted, equations.definitions)
         self.joint_rates = {f"qdot:{angle}": velocities[angle] for angle, _ in self.joints}
         joint_accelerations = {f"vdot:{angle}": accelerations[rate] for angle, rate in self.joints}
         self.motion = {**self.joint_rates, **joint_accelerations}
-        self.observation, self.judgement = list(observation), list(judgement)
-        outputs = {**_integrated(self.flow), **observation, **judgement, **self.motion}
-        self.program = Program(outputs, [sp.Symbol(name) for name in scene.parameters])
+        self.observation, self.judgement, self.ending = list(observation), list(judgement), list(ending)
+        self.targets = self._targets([*observation.values(), *judgement.values(), *ending.values()])
+        outputs = {**_integrated(self.flow), **observation, **judgement, **ending, **self.motion}
+        self.program = Program(outputs, [sp.Symbol(name) for name in scene.parameters], equations.definitions)
         self.memory = self._memory()
 
-    def _task_expressions(self) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr]]:
-        """Observation and judgement (reward terms, then info) as expressions in the states."""
+    def _task_expressions(self) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr], dict[str, sp.Expr]]:
+        """Observation, judgement (reward terms, then info) and termination as expressions in the states."""
         task = self.scene.task
         if task is None:
-            return {}, {}
+            return {}, {}, {}
         scope = _scope(self.scene, self.equations, self.actions)
+        scope |= self._definitions(task, scope)
 
-        def read(kind: str, texts: Mapping[str, str]) -> dict[str, sp.Expr]:
-            try:
-                return {f"{kind}:{label}": to_sympy(text, scope) for label, text in texts.items()}
-            except ExpressionError as error:
-                raise ExpressionError(f"task {task.name!r}, {kind}: {error}") from None
+        def read(kind: str, texts: Mapping[str, str], **more: sp.Symbol) -> dict[str, sp.Expr]:
+            return {f"{kind}:{label}": _read(task, kind, text, {**scope, **more}) for label, text in texts.items()}
 
-        observation = read("observation", {**self.scene.mechanism.observation, **task.observation})
-        return observation, {**read("reward", task.reward), **read("info", task.info)}
+        seen = self.scene.mechanism.observation or default_observation(self.scene.mechanism)
+        observation = read("observation", {**seen, **task.observation})
+        ending = read("terminated", {"": task.terminated} if task.terminated is not None else {})
+        over = {"terminated": TERMINATED_NOW} if ending else {}
+        judgement = {**read("reward", task.reward, **over), **read("info", task.info, **over)}
+        of_a_step = {*self.actions, *map(initial, self.equations.coordinates)}
+        for kind, expression in (*observation.items(), *ending.items()):
+            if expression.free_symbols & of_a_step:
+                raise ExpressionError(
+                    f"task {task.name!r}, {kind.rstrip(':')}: what is observed, and whether an episode ends, must "
+                    "follow from the state and the targets alone, without effort and NAME_before"
+                )
+        return observation, judgement, ending
+
+    def _definitions(self, task: Task, scope: Mapping[str, sp.Expr]) -> dict[str, sp.Expr]:
+        """Meaning of the task's shorthands, after the step and, where coordinates suffice, before it."""
+        before = {q: initial(q) for q in self.equations.coordinates}
+        fixed = {sp.Symbol(name) for name in (*self.scene.parameters, *task.targets)}
+        meanings: dict[str, sp.Expr] = {}
+        for name, text in task.definitions.items():
+            meanings[name] = _read(task, "definitions", text, {**scope, **meanings})
+            if meanings[name].free_symbols <= fixed | before.keys():
+                meanings[f"{name}_before"] = meanings[name].xreplace(before)
+        return meanings
+
+    def _targets(self, outputs: list[sp.Expr]) -> list[sp.Symbol]:
+        """The task's targets that something depends on."""
+        names = self.scene.task.targets if self.scene.task else ()
+        used = {symbol for output in outputs for symbol in output.free_symbols}
+        return [symbol for symbol in map(sp.Symbol, names) if symbol in used]
 
     def _wanted(self, rates: Iterable[sp.Symbol], outputs: list[sp.Expr]) -> list[sp.Expr]:
         """What must be known after a step; without a task, everything."""
@@ -92,6 +124,8 @@ class _Generator:
             "control": m, "new": n, "free": joints, "work": 2 * joints, "hits": joints,
             "count": min(history, 1), "history": history * m,
         }  # fmt: skip
+        if self.targets:
+            sizes["target"] = len(self.targets)
         places, offset = {}, 0
         for name, size in sizes.items():
             places[name] = (offset, offset + size)
@@ -117,15 +151,17 @@ class _Generator:
         chosen, substeps = self._method()
         states, controls = flow.states, self.equations.controls
         before = [initial(state) for state in states]
-        judged = (*states, *before, *self.actions)
+        judged = (*states, *before, *self.actions, *self.targets, *([TERMINATED_NOW] if self.ending else []))
         parts = [
             f'"""{self._title(chosen, substeps)}"""\n\n{backend.header}',
             self._tables(),
             program.constants_function("constants", [sp.Symbol(name) for name in self.scene.parameters]),
             program.step_function("advance_states", flow, chosen, substeps, (*controls, *self.free), backend),
-            program.function("observe", states, self.observation, backend),
+            program.function("observe", (*states, *self.targets), self.observation, backend),
             program.function("judge", judged, self.judgement, backend),
         ]
+        if self.ending:
+            parts.append(program.function("ends", (*states, *self.targets), self.ending, backend))
         if self.joints:
             constants = "".join(f"{name} = {getattr(stops, name)!r}\n" for name in stops.CONSTANTS)
             parts += [
@@ -160,6 +196,8 @@ class _Generator:
             "MEMORY": self.memory,
             "SIZE": max(end for _, end in self.memory.values()),
         }
+        if self.targets:
+            tables["TARGETS"] = tuple(target.name for target in self.targets)
         return "".join(f"{name} = {value!r}\n" for name, value in tables.items())
 
     def _respond(self) -> str:
@@ -170,16 +208,18 @@ class _Generator:
         """
         actions = ", ".join(action.name for action in self.actions)
         entries = ", ".join(f"{_label(name)!r}: result[{i + 2}]" for i, name in enumerate(self.judgement))
+        call, imports = [f"result = step(memory, observation, {actions})"], "dtype, empty"
+        if not self.backend.decorator:  # NumPy's numbers warn where compiled ones do not, and are no floats
+            call = ["with errstate(all='ignore'):", *(f"    {line}" for line in call), "result = [*map(float, result)]"]
+            imports += ", errstate"
         lines = [
             f"{actions}, = action.tolist()",
             f"observation = empty({len(self.observation)}, FLOAT32)",
-            f"result = step(memory, observation, {actions})",
+            *call,
             f"return observation, result[1], result[0] or False, False, {{{entries}}}",
         ]
         text = textwrap.indent("\n".join(lines), "    ")
-        return (
-            f"from numpy import dtype, empty\n\nFLOAT32 = dtype('float32')\n\n\ndef respond(memory, action):\n{text}\n"
-        )
+        return f"from numpy import {imports}\n\nFLOAT32 = dtype('float32')\n\n\ndef respond(memory, action):\n{text}\n"
 
     def _array_forms(self) -> list[str]:
         """`advance` and `motion` over arrays, for the stops."""
@@ -236,12 +276,22 @@ class _Generator:
             f"    status = {DIVERGED}",
             f"{state}, = {new}",
         ]
+        aim = "".join(f"memory[{place['target'] + i}], " for i in range(len(self.targets)))
         if self.observation:
-            targets = _items("observation", len(self.observation))
-            lines.append(f"{targets}, = observe({new}k)")
+            seen = _items("observation", len(self.observation))
+            lines.append(f"{seen}, = observe({new}{aim}k)")
+        over = ""
+        if self.ending:
+            over = "over, "
+            lines += [
+                "over = 0.0",
+                f"if status == {RUNNING} and ends({new}{aim}k)[0] > 0.0:",
+                "    over = 1.0",
+                f"    status = {TERMINATED}",
+            ]
         reward = "0.0"
         if self.judgement:
-            lines.append(f"judged = judge({new}{old}{', '.join(a.name for a in self.actions)}, k)")
+            lines.append(f"judged = judge({new}{old}{', '.join(a.name for a in self.actions)}, {aim}{over}k)")
             rewards = [i for i, name in enumerate(self.judgement) if name.startswith("reward:")]
             reward = " + ".join(f"judged[{i}]" for i in rewards)
         lines.append(f"return (status, {reward}, {''.join(f'judged[{i}], ' for i in range(len(self.judgement)))})")
@@ -304,8 +354,12 @@ def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) 
             "x": scope[x],
             "y": scope[y],
             "heading": scope[heading],
+            "x_dot": vx,
+            "y_dot": vy,
+            "heading_dot": scope[f"{heading}_dot"],
             "x_before": scope[f"{x}_before"],
             "y_before": scope[f"{y}_before"],
+            "heading_before": scope[f"{heading}_before"],
             "speed": (cos * vx + sin * vy).xreplace(pose),
             "drift": (cos * vy - sin * vx).xreplace(pose),
         }
@@ -315,10 +369,19 @@ def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) 
                     f"{mechanism.name} has its own {name!r}, which tasks in the plane use for {meaning}; rename it"
                 )
         scope |= roles
-    for name in (*(task.weights if task else ()), "dt", "forward", "effort"):
+    words = (*task.weights, *task.targets, *task.definitions) if task else ()
+    for name in (*words, "dt", "forward", "effort", "terminated"):
         if name in mechanism.coordinates or name in mechanism.parameters:
             raise ExpressionError(f"{mechanism.name} has its own {name!r}, a word that tasks use; rename it")
-    return scope
+    return scope | {name: sp.Symbol(name) for name in (task.targets if task else ())}
+
+
+def _read(task: Task, kind: str, text: str, scope: Mapping[str, sp.Expr]) -> sp.Expr:
+    """Expression of a task's text."""
+    try:
+        return to_sympy(text, scope)
+    except ExpressionError as error:
+        raise ExpressionError(f"task {task.name!r}, {kind}: {error}") from None
 
 
 def _joint(equations: ReducedEquations, joint: str) -> tuple[sp.Symbol, sp.Symbol]:

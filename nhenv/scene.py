@@ -5,7 +5,8 @@ The kernel works on a flat float64 memory, whose parts its table MEMORY names:
     step(memory, observation, *action) -> (status, reward, *reward terms, *info)
 
 It clips the action, integrates one hold through every impact on a stop, and judges the outcome.
-States that nothing observed, rewarded or reported depends on are not in it.
+States that nothing observed, rewarded or reported depends on are not in it. What is drawn for an
+episode, the task's targets, has a place in the memory too.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ from mechanics.expressions import unknown_name
 from mechanics.mechanism import Mechanism
 from nhenv.tasks import Task
 
-__all__ = ["BAD_ACTION", "DIVERGED", "HISTORY_FULL", "RUNNING", "Scene"]
+__all__ = ["BACKENDS", "BAD_ACTION", "DIVERGED", "HISTORY_FULL", "RUNNING", "TERMINATED", "Scene"]
 
-RUNNING, BAD_ACTION, DIVERGED, HISTORY_FULL = 0.0, 1.0, 2.0, 3.0
+RUNNING, BAD_ACTION, DIVERGED, HISTORY_FULL, TERMINATED = 0.0, 1.0, 2.0, 3.0, 4.0
+
+BACKENDS = ("numba", "numpy")  # those of `mechanics.compiler.codegen`, which loads SymPy
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Scene:
     def __post_init__(self) -> None:
         if self.integrator not in ("auto", *method_names()):
             raise ValueError(unknown_name("integrator", str(self.integrator), ("auto", *method_names())))
+        if self.backend not in BACKENDS:
+            raise ValueError(unknown_name("backend", str(self.backend), BACKENDS))
         self.mechanism.frame_rows(self.frame)  # refuses a name that is not there
 
     @cached_property
@@ -64,6 +69,11 @@ class Scene:
         """Names of the numbers that `constants` of the kernel takes, in order."""
         weights = self.task.weights if self.task else ()
         return (*self.mechanism.parameters, *weights, "dt", "forward")
+
+    @cached_property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the task's targets that the kernel uses, in the order of their places."""
+        return getattr(self.kernel, "TARGETS", ())
 
     @cached_property
     def joints(self) -> tuple[str, ...]:
@@ -77,8 +87,8 @@ class Scene:
         specification["mechanism"] = self.mechanism.to_dict()
         specification["task"] = dataclasses.asdict(self.task) if self.task else None
         name = f"{self.mechanism.name}_{self.task.name if self.task else 'state'}_{self.backend}"
-        folder = Path(__file__).parent
-        return kernels.load(name, specification, self.source, deriving=(folder / "scene.py", folder / "generate.py"))
+        deriving = tuple(Path(__file__).with_name(f"{part}.py") for part in ("scene", "generate", "observation"))
+        return kernels.load(name, specification, self.source, deriving=deriving)
 
     @cached_property
     def whole(self) -> Scene:
@@ -106,6 +116,11 @@ class Scene:
         """Write a state, q (n,) and v (k,), into a memory."""
         values = dict(zip(self.states, (*q, *v), strict=True))
         memory[slice(*self.kernel.MEMORY["state"])] = [values[name] for name in self.kernel.STATES]
+
+    def aim(self, memory: NDArray[np.float64], targets: Mapping[str, float]) -> None:
+        """Write the targets of an episode, as `Task.draw` returns them, into a memory."""
+        if self.targets:
+            memory[slice(*self.kernel.MEMORY["target"])] = [targets[name] for name in self.targets]
 
     def values(self, memory: NDArray[np.float64]) -> dict[str, float]:
         """Value of each state that this scene follows, by name."""

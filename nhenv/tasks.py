@@ -2,15 +2,18 @@
 
 A task is written in the language of `mechanics.expressions`, over these names:
 
-NAME           a coordinate or parameter of the mechanism, after the step
-NAME_dot       the rate of a coordinate
-NAME_before    a coordinate at the beginning of the step
-heading        the third fibre coordinate
-speed, drift   velocity along and across the heading, m/s
-effort         mean squared action of the step, between 0 and 1
-forward        +1 or -1: the way along x in which the mechanism's gaits drive it
-dt             control period, s
-WEIGHT         one of the task's own weights
+NAME            a coordinate or parameter of the mechanism, after the step
+NAME_dot        the rate of a coordinate
+x, y, heading   the fibre coordinates, whatever the mechanism calls them; also x_dot, y_dot, heading_dot
+speed, drift    velocity along and across the heading, m/s
+effort          mean squared action of the step, between 0 and 1
+forward         +1 or -1: the way along x in which the mechanism's gaits drive it
+dt              control period, s
+WEIGHT          one of the task's own weights
+TARGET          a number that is drawn at reset and kept for the episode
+DEFINITION      one of the task's own shorthands
+NAME_before     a coordinate, x, y, heading or a DEFINITION made of coordinates at the beginning of the step
+terminated      1 if the task ends the episode with this step, else 0; in rewards and info only
 
 so that any mechanism with a pose in the plane can be given any task, and a kernel computes only
 what the expressions reach.
@@ -18,17 +21,29 @@ what the expressions reach.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
 
-from mechanics.expressions import unknown_name
+import numpy as np
 
-__all__ = ["TASKS", "Task", "get"]
+from mechanics.expressions import ExpressionError, check_name, evaluate, names_in, unknown_name
+from mechanics.mechanism import Mechanism
+
+__all__ = ["POSE", "TASKS", "Task", "get"]
+
+# Names that a mechanism has if it declares a fibre.
+POSE = (
+    "x", "y", "heading", "x_dot", "y_dot", "heading_dot", "x_before", "y_before", "heading_before", "speed", "drift",
+)  # fmt: skip
+_WORDS = ("effort", "forward", "dt")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A task.
+    """A task, which checks itself on construction.
 
     Attributes:
         name: CamelCase, part of the environment's id.
@@ -36,6 +51,10 @@ class Task:
         reward: info key -> expression; the reward is their sum.
         info: info key -> expression, reported and not rewarded.
         weights: weight -> default; each is an argument of the environment.
+        targets: name -> (low, high), drawn uniformly at reset in this order, or an expression in the targets
+            before it; a number for the whole episode.
+        definitions: shorthand -> expression; one may use those before it.
+        terminated: expression; the episode ends with the step after which it is positive. None: it never does.
         max_episode_steps: steps after which the registered environment truncates.
     """
 
@@ -44,7 +63,102 @@ class Task:
     reward: Mapping[str, str]
     info: Mapping[str, str] = field(default_factory=dict)
     weights: Mapping[str, float] = field(default_factory=dict)
+    targets: Mapping[str, tuple[float, float] | str] = field(default_factory=dict)
+    definitions: Mapping[str, str] = field(default_factory=dict)
+    terminated: str | None = None
     max_episode_steps: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not re.fullmatch(r"[A-Z][A-Za-z0-9]*", self.name):
+            raise ValueError(f"a task's name must be CamelCase letters and digits, as in an id, got {self.name!r}")
+        self._check_names()
+        for name, rule in self.targets.items():
+            if not isinstance(rule, str) and not _is_interval(rule):
+                raise ValueError(
+                    f"task {self.name!r}: target {name!r} must be (low, high), two finite numbers in this order, or an "
+                    f"expression in the targets before it; got {rule!r}"
+                )
+        self._check_expressions()
+        steps = self.max_episode_steps
+        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+            raise ValueError(f"task {self.name!r}: max_episode_steps must be a positive whole number, got {steps!r}")
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Task:
+        """Build a task from plain data, such as `dataclasses.asdict` of one, or that read back from JSON."""
+        known = [f.name for f in fields(cls)]
+        for key in data:
+            if key not in known:
+                raise ValueError(f"in a task's data: {unknown_name('key', str(key), known)}")
+        for key in ("name", "reward", "max_episode_steps"):
+            if key not in data:
+                raise ValueError(f"a task's data lack {key!r}; they have {', '.join(map(str, data))}")
+        rules = {name: tuple(r) if isinstance(r, list) else r for name, r in data.get("targets", {}).items()}
+        return cls(**{**data, "targets": rules})
+
+    def draw(self, rng: np.random.Generator, given: Mapping[str, float]) -> dict[str, float]:
+        """Targets of an episode by name; those `given` replace what is drawn, and others may follow from them.
+
+        What is given does not change what is drawn.
+        """
+        values: dict[str, float] = {}
+        for name, rule in self.targets.items():
+            value = evaluate(rule, values) if isinstance(rule, str) else rng.uniform(*rule)
+            values[name] = float(given.get(name, value))
+        return values
+
+    def missing(self, mechanism: Mechanism) -> tuple[str, ...]:
+        """Names that this task uses and `mechanism` does not have: none if the task fits."""
+        known = {*_WORDS, *self.weights, *self.targets, *self.definitions}
+        known |= {*mechanism.coordinates, *mechanism.rates, *mechanism.parameters}
+        known |= {f"{name}_before" for name in (*mechanism.coordinates, *self.definitions)}
+        known |= set(POSE) if mechanism.fibre else set()
+        known |= {"terminated"} if self.terminated is not None else set()
+        used = {name for _, text in self._texts() for name in names_in(text)}
+        return tuple(sorted(used - known))
+
+    def _texts(self) -> Iterable[tuple[str, str]]:
+        """Every expression, with the word for where it stands."""
+        for kind in ("definitions", "observation", "reward", "info"):
+            for label, text in getattr(self, kind).items():
+                yield f"{kind}, {label}", text
+        if self.terminated is not None:
+            yield "terminated", self.terminated
+
+    def _check_names(self) -> None:
+        seen: dict[str, str] = {}
+        for kind, names in (("weight", self.weights), ("target", self.targets), ("definition", self.definitions)):
+            for name in names:
+                check_name(name, f"task {self.name!r}: {kind}")
+                if name in (*POSE, *_WORDS, "terminated") or re.fullmatch(r"v\d+|\w+_(dot|before)", name):
+                    raise ExpressionError(f"task {self.name!r}: {kind} {name!r} is a word with a meaning of its own")
+                if name in seen:
+                    raise ExpressionError(f"task {self.name!r}: {name!r} is both a {seen[name]} and a {kind}")
+                seen[name] = kind
+        for key in self.info:
+            if key in self.reward:
+                raise ValueError(f"task {self.name!r}: {key!r} is both a reward and info")
+
+    def _check_expressions(self) -> None:
+        try:
+            earlier: list[str] = []
+            for name, rule in self.targets.items():
+                kind = f"targets, {name}"
+                for unknown in (names_in(rule) if isinstance(rule, str) else set()) - set(earlier):
+                    raise ExpressionError(unknown_name("target", unknown, earlier))
+                earlier.append(name)
+            for kind, text in self._texts():  # noqa: B007 (named in the error)
+                names_in(text)
+        except ExpressionError as error:
+            raise ExpressionError(f"task {self.name!r}, {kind}: {error}") from None
+
+
+def _is_interval(rule: Any) -> bool:
+    try:
+        low, high = map(float, rule)
+    except (TypeError, ValueError):
+        return False
+    return math.isfinite(low) and math.isfinite(high) and low <= high
 
 
 TASKS: tuple[Task, ...] = (
@@ -59,12 +173,70 @@ TASKS: tuple[Task, ...] = (
         weights={"forward_reward_weight": 1.0, "ctrl_cost_weight": 0.02},
         max_episode_steps=300,
     ),
+    # Velocities at the end of the step, not differences of positions: x and y are never integrated.
+    Task(
+        name="Velocity",
+        observation={
+            "cos_heading": "cos(heading)",
+            "sin_heading": "sin(heading)",
+            "commanded_speed": "commanded_speed",
+        },
+        reward={
+            "reward_velocity": "1 - velocity_cost_weight*abs(forward*x_dot - commanded_speed)",
+            "reward_sideways": "-sideways_cost_weight*abs(y_dot)",
+            "reward_ctrl": "-ctrl_cost_weight*effort",
+        },
+        info={"x_velocity": "x_dot", "y_velocity": "y_dot"},
+        weights={"velocity_cost_weight": 2.0, "sideways_cost_weight": 0.2, "ctrl_cost_weight": 0.02},
+        targets={"commanded_speed": (0.2, 1.0)},
+        max_episode_steps=300,
+    ),
+    Task(
+        name="Goal",
+        observation={
+            # The direction of the goal; a nanometre keeps it finite on the goal itself.
+            "goal_ahead": "(cos(heading)*to_goal_x + sin(heading)*to_goal_y)/(to_goal + 1e-9)",
+            "goal_left": "(cos(heading)*to_goal_y - sin(heading)*to_goal_x)/(to_goal + 1e-9)",
+            "goal_distance": "to_goal/2",
+        },
+        reward={
+            "reward_progress": "progress_reward_weight*(to_goal_before - to_goal)/dt",
+            "reward_time": "-time_cost_weight",
+            "reward_ctrl": "-ctrl_cost_weight*effort",
+            "reward_goal": "goal_reward_weight*terminated",
+        },
+        info={"x_position": "x", "y_position": "y", "goal_distance": "to_goal", "is_success": "terminated"},
+        weights={
+            "progress_reward_weight": 1.0,
+            "time_cost_weight": 0.5,
+            "ctrl_cost_weight": 0.02,
+            "goal_reward_weight": 5.0,
+            "goal_radius": 0.15,
+        },
+        targets={
+            "start_distance": (1.0, 3.0),
+            "start_bearing": (-math.pi, math.pi),
+            "goal_x": "start_distance*cos(start_bearing)",
+            "goal_y": "start_distance*sin(start_bearing)",
+        },
+        definitions={
+            "to_goal_x": "goal_x - x",
+            "to_goal_y": "goal_y - y",
+            "to_goal": "sqrt(to_goal_x**2 + to_goal_y**2)",
+        },
+        terminated="goal_radius - to_goal",
+        max_episode_steps=300,
+    ),
 )
 
 
-def get(name: str) -> Task:
-    """Task of this name; raise ValueError with the known names if there is none."""
-    for task in TASKS:
-        if task.name == name:
-            return task
-    raise ValueError(unknown_name("task", str(name), [task.name for task in TASKS]))
+def get(task: str | Mapping[str, Any] | Task) -> Task:
+    """Task of this name, or made of these plain data; raise ValueError with the known names if there is none."""
+    if isinstance(task, Task):
+        return task
+    if isinstance(task, Mapping):
+        return Task.from_dict(task)
+    for known in TASKS:
+        if known.name == task:
+            return known
+    raise ValueError(unknown_name("task", str(task), [known.name for known in TASKS]))

@@ -1,4 +1,4 @@
-"""Compare PPO with a tuned gait, on every environment that has training settings.
+"""Compare PPO with a tuned gait, on the two mechanisms of the paper.
 
 python -m training.compare
 
@@ -14,7 +14,7 @@ import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ import torch
 import tyro
 from rich.console import Console
 
-import nhenv
 from training import config as settings_of
 from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id, training_seed
 from training.evaluate import METRICS, Controller, Rollout, evaluate, load_policy, locomotion, make_envs, summary
@@ -35,10 +34,6 @@ from training.store import machine, read_json, versions, write_bytes, write_json
 from training.train import ppo_path, train_piece
 
 __all__ = ["Compare", "compare", "judge"]
-
-
-def _comparable() -> tuple[str, ...]:
-    return tuple(name for name in nhenv.environment_ids() if settings_of.task_name(name) in settings_of.CONFIGS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +49,7 @@ class Compare:
         quick: far too short runs, to see that everything works.
     """
 
-    env_ids: tuple[str, ...] = field(default_factory=_comparable)
+    env_ids: tuple[str, ...] = settings_of.COMPARED
     seeds: tuple[int, ...] = (0, 1, 2)
     timesteps: int | None = None
     out: Path = Path("runs/compare")

@@ -10,8 +10,10 @@ import gymnasium as gym
 
 import nhenv
 from mechanics.expressions import unknown_name
+from nhenv import tasks
 
 __all__ = [
+    "COMPARED",
     "CONFIGS",
     "EVALUATION_SEEDS",
     "SEEDS_PER_RUN",
@@ -133,6 +135,9 @@ class TaskConfig:
 
 CONFIGS: dict[str, TaskConfig] = {"Forward": TaskConfig()}
 
+# The environments of the main job: the paper's two mechanisms, whose gaits are known.
+COMPARED = ("nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0")
+
 
 def quick(config: TaskConfig) -> TaskConfig:
     """The same experiment, far too short: it shows that everything runs."""
@@ -168,4 +173,4 @@ def training_seed(run: int) -> int:
 def task_name(env_id: str) -> str:
     """Name of the task of a registered environment."""
     kwargs: dict[str, Any] = gym.spec(env_id).kwargs
-    return kwargs["task"]
+    return tasks.get(kwargs["task"]).name

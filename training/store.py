@@ -15,8 +15,8 @@ from typing import Any
 
 import gymnasium as gym
 
-import mechanics
 from nhenv import tasks
+from nhenv.registration import as_mechanism
 
 __all__ = [
     "digest",
@@ -51,7 +51,7 @@ def settings(env_id: str, code: str, **config: Any) -> dict[str, Any]:
     return {
         "env_id": env_id,
         "max_episode_steps": spec.max_episode_steps,
-        "mechanism": mechanics.get(spec.kwargs["mechanism"]).to_dict(),
+        "mechanism": as_mechanism(spec.kwargs["mechanism"]).to_dict(),
         "task": dataclasses.asdict(tasks.get(spec.kwargs["task"])),
         "code": code,
         **{k: dataclasses.asdict(v) if dataclasses.is_dataclass(v) else v for k, v in config.items()},  # type: ignore[arg-type]

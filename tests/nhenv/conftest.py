@@ -4,13 +4,38 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import mechanics
 import nhenv
 
+# Their environments are compiled. Those of the other mechanisms are interpreted, and only in the slow tests; that
+# both backends agree is a test of its own.
+COMPILED = ("snakeboard", "roller_racer")
 
-@pytest.fixture(params=nhenv.environment_ids())
+
+def _is_compiled(env_id):
+    mechanism = gym.spec(env_id.removeprefix("nhenv:")).kwargs["mechanism"]
+    return mechanism in COMPILED or mechanism not in mechanics.names()
+
+
+def _ids():
+    for env_id in nhenv.environment_ids():
+        yield env_id if _is_compiled(env_id) else pytest.param(env_id, marks=pytest.mark.slow)
+
+
+def _backend(env_id):
+    return {} if _is_compiled(env_id) else {"backend": "numpy"}
+
+
+@pytest.fixture(params=_ids())
 def env_id(request):
     """Each registered id in turn."""
     return request.param
+
+
+@pytest.fixture
+def backend():
+    """Arguments for making the environment of an id in the tests' usual way."""
+    return _backend
 
 
 @pytest.fixture
@@ -19,7 +44,7 @@ def make():
     made = []
 
     def make_env(env_id, **kwargs):
-        made.append(gym.make(env_id, **kwargs))
+        made.append(gym.make(env_id, **{**_backend(env_id), **kwargs}))
         return made[-1]
 
     yield make_env
@@ -32,7 +57,7 @@ def bare():
     """Make an environment without wrappers: no time limit, no checks but its own."""
 
     def make_env(env_id, **kwargs):
-        return gym.make(env_id, disable_env_checker=True, **kwargs).unwrapped
+        return gym.make(env_id, disable_env_checker=True, **{**_backend(env_id), **kwargs}).unwrapped
 
     return make_env
 

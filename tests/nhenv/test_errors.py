@@ -50,6 +50,7 @@ ARGUMENTS = {
     "task misspelt": (SNAKEBOARD, {"task": "Foward"}, ValueError, ["'Foward'", "known", "mean 'Forward'"]),
     "weight misspelt": (RACER, {"ctrl_cost_wieght": 0.1}, TypeError, ["'ctrl_cost_wieght'", "mean 'ctrl_cost_weight'"]),
     "weight NaN": (RACER, {"ctrl_cost_weight": np.nan}, ValueError, ["ctrl_cost_weight", "finite", "nan"]),
+    "backend misspelt": (RACER, {"backend": "nunba"}, ValueError, ["'nunba'", "numpy", "mean 'numba'"]),
     "substeps zero": (RACER, {"substeps": 0}, ValueError, ["substeps", "positive whole", "got 0"]),
     "substeps fraction": (RACER, {"substeps": 1.5}, ValueError, ["substeps", "whole", "1.5"]),
     "noise negative": (RACER, {"reset_noise_scale": -0.1}, ValueError, ["reset_noise_scale", "at least 0", "-0.1"]),
@@ -89,9 +90,9 @@ def test_drawing_is_refused():
 # -- reset --------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def env(env_id, bare):
-    return bare(env_id)
+@pytest.fixture(params=[SNAKEBOARD, RACER])
+def env(request, bare):
+    return bare(request.param)
 
 
 @pytest.mark.parametrize(

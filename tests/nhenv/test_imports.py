@@ -11,6 +11,7 @@ import numpy as np
 import nhenv
 
 ROOT = Path(__file__).parents[2]
+IDS = [f"nhenv/{mechanism}{task.name}-v0" for mechanism in ("Snakeboard", "RollerRacer") for task in nhenv.TASKS]
 HEAVY = ("sympy", "mpmath", "torch", "stable_baselines3", "pygame", "matplotlib")
 
 SCRIPT = f"""
@@ -19,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 import nhenv
 
-for env_id in nhenv.environment_ids():
+for env_id in {IDS}:
     env = gym.make(env_id)
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -33,7 +34,7 @@ print(*(name for name in {HEAVY} if name in sys.modules))
 
 
 def test_a_thousand_steps_load_no_heavy_library(kernel_cache):
-    for env_id in nhenv.environment_ids():  # fill the cache
+    for env_id in IDS:  # fill the cache
         bare = gym.make(env_id).unwrapped
         bare.reset(seed=0)
         assert np.isfinite([*bare.q, bare.energy]).all()

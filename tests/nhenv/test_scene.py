@@ -12,10 +12,14 @@ import pytest
 
 import mechanics
 import nhenv
+from mechanics.compiler import codegen
 from mechanics.mechanism import Mechanism
 from nhenv import tasks
 from nhenv.env import LocomotionEnv
-from nhenv.scene import Scene
+from nhenv.scene import BACKENDS, Scene
+
+NAMES = ("snakeboard", "roller_racer")
+OTHERS = [name for name in mechanics.names(in_the_plane=True) if name not in NAMES]
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +49,7 @@ def test_forward_never_integrates_what_it_does_not_use(name, pruned, stops, sour
 
 
 def test_a_scene_introduces_itself(source):
-    for name in mechanics.names():
+    for name in NAMES:
         text = source(name)
         head = text[: text.index('"""', 3)]
         for word in (name, "Forward", "do not edit", "Integrator", "operations", "States"):
@@ -62,9 +66,17 @@ def test_default_integrators_are_those_of_the_design(source):
 
 
 def test_no_stop_no_code_for_stops(source):
-    for name in mechanics.names():
+    for name in NAMES:
         assert "first_hit" in source(name)
         assert "first_hit" not in source(name, stops=False)
+
+
+def test_no_target_and_no_end_no_code_for_them(source):
+    goal = Scene(mechanics.get("snakeboard"), tasks.get("Goal")).source()
+    traces = ("TARGETS", "'target'", "def ends", "over = ", "_terminated")
+    assert all(trace in goal for trace in traces)
+    for name in NAMES:
+        assert not [trace for trace in traces if trace in source(name)]
 
 
 def test_sources_do_not_depend_on_hashes(source):
@@ -118,17 +130,28 @@ def test_names_do_not_matter(actions):
 
 
 def test_ids_are_camel_case_of_their_mechanisms():
-    assert nhenv.environment_ids() == ("nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0")
+    assert nhenv.environment_ids()[:4] == (
+        "nhenv/SnakeboardForward-v0",
+        "nhenv/SnakeboardVelocity-v0",
+        "nhenv/SnakeboardGoal-v0",
+        "nhenv/RollerRacerForward-v0",
+    )
 
 
-@pytest.mark.parametrize("name", mechanics.names())
-def test_backends_agree_through_impacts(name):
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [
+        *((name, task) for name in NAMES for task in ("Forward", "Goal")),
+        *(pytest.param(name, "Goal", marks=pytest.mark.slow) for name in OTHERS),
+    ],
+)
+def test_backends_agree_through_impacts(name, task):
     """The NumPy row interprets the text that the Numba row compiles, stops included."""
-    env, rng = LocomotionEnv(name), np.random.default_rng(1)
+    env, rng = LocomotionEnv(name, task), np.random.default_rng(1)
     env.reset(seed=0)
-    scenes = [dataclasses.replace(env._scene, backend=backend) for backend in ("numba", "numpy")]
+    scenes = [dataclasses.replace(env._scene, backend=backend) for backend in BACKENDS]
     memories = [env._memory.copy() for _ in scenes]
-    impacts = 0
+    limits, impacts = env.joint_limits, 0
     for _ in range(100):
         action = rng.uniform(-1, 1, env.action_space.shape)
         one, other = (s.kernel.respond(m, action) for s, m in zip(scenes, memories, strict=True))
@@ -136,5 +159,11 @@ def test_backends_agree_through_impacts(name):
         assert memories[1] == pytest.approx(memories[0], rel=1e-9, abs=1e-9)
         assert other[0] == pytest.approx(one[0], rel=1e-6, abs=1e-6)  # float32
         assert other[1] == pytest.approx(one[1], rel=1e-9, abs=1e-9)
-        impacts += abs(scenes[0].values(memories[0])[env.mechanism.coordinates[-1]]) == 1.2
-    assert impacts > 3  # the last coordinate of both is the joint with stops
+        assert [type(value) for value in other[1:4]] == [type(value) for value in one[1:4]] == [float, bool, bool]
+        values = scenes[0].values(memories[0])
+        impacts += any(abs(values[joint]) == limit for joint, limit in limits.items())
+    assert impacts > 3 or not limits or name not in NAMES
+
+
+def test_backends_are_those_of_the_generator():
+    assert sorted(BACKENDS) == sorted(codegen.BACKENDS)

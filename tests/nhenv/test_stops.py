@@ -44,6 +44,12 @@ class Joint:
         return u
 
 
+@pytest.fixture(params=["nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0"])
+def env_id(request):
+    """Stops have nothing to do with tasks."""
+    return request.param
+
+
 @pytest.fixture
 def joint(env_id, bare):
     """Joint of an environment whose torque limits are 1 unless asked."""

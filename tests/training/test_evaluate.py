@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-import nhenv
 from mechanics.mechanism import Mechanism
+from training.config import COMPARED
 from training.evaluate import Evaluate, joint_index, locomotion, make_envs, measure, rollout, summary
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
-every_environment = pytest.mark.parametrize("env_id", nhenv.environment_ids())
+every_environment = pytest.mark.parametrize("env_id", COMPARED)
 
 
 class Constant:

@@ -2,8 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import nhenv
-from training.config import GaitConfig, for_env
+from training.config import COMPARED, GaitConfig, for_env
 from training.evaluate import evaluate, locomotion, make_envs, measure, rollout
 from training.gaits import Gait, Joints, Sinusoid, bounds, gait_path, sinusoid, tune, tune_piece
 from training.store import read_json
@@ -11,7 +10,7 @@ from training.store import read_json
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = GaitConfig(population=16, generations=4, starts=1)
 
-every_environment = pytest.mark.parametrize("env_id", nhenv.environment_ids())
+every_environment = pytest.mark.parametrize("env_id", COMPARED)
 
 
 @pytest.fixture
@@ -25,7 +24,7 @@ def moving(request):
     return locomotion(env), observation
 
 
-on_the_move = pytest.mark.parametrize("moving", nhenv.environment_ids(), indirect=True)
+on_the_move = pytest.mark.parametrize("moving", COMPARED, indirect=True)
 
 
 @on_the_move
