@@ -16,6 +16,7 @@ from oracles import multiplier_acceleration
 import mechanics
 from mechanics import Mechanism, Model
 from mechanics.geometry import reduce
+from mechanics.geometry.reduction import derive
 
 USER = Path(__file__).parents[1] / "data" / "user"
 
@@ -152,3 +153,76 @@ def test_both_arithmetics_give_the_same_equations(name, monkeypatch):
     # Zeros are seen by both.
     pattern = [e == 0 for e in sp.flatten(steps.christoffel)]
     assert pattern == [e == 0 for e in sp.flatten(reduce(mechanism).christoffel)]
+
+
+def derivative(function, q, direction):
+    """Derivative of an array-valued function along a direction, by central differences of sixth order."""
+    step, weights = 1e-2, {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+    ahead_minus_behind = (
+        w * (function(q + k * step * direction) - function(q - k * step * direction)) for k, w in weights.items()
+    )
+    return sum(ahead_minus_behind) / step
+
+
+class InNumbers:
+    """Levi-Civita connection and projection of a mechanism at its default parameters, by differences."""
+
+    def __init__(self, mechanism, q):
+        self.mechanism, self.q, n = mechanism, q, mechanism.n
+        dM = np.array([derivative(self.inertia, q, axis) for axis in np.eye(n)])  # [c, a, b] = ∂_c M_ab
+        lowered = (np.einsum("kij->ijk", dM) + np.einsum("jik->ijk", dM) - dM) / 2
+        self.christoffel = np.linalg.solve(self.inertia(q), lowered.reshape(n, n * n)).reshape(n, n, n)
+
+    def numeric(self, rows, q):
+        values = self.mechanism.parameters | dict(zip(self.mechanism.coordinates, q, strict=True))
+        return self.mechanism.numeric(rows, values)
+
+    def inertia(self, q):
+        return self.numeric(self.mechanism.inertia, q)
+
+    def complement(self, q):
+        """P⊥."""
+        if not self.mechanism.one_forms:
+            return np.zeros((self.mechanism.n, self.mechanism.n))
+        forms = self.numeric(self.mechanism.one_forms, q)
+        raised = np.linalg.solve(self.inertia(q), forms.T)
+        return raised @ np.linalg.solve(forms @ raised, forms)
+
+    def nabla(self, X, Y):
+        """∇_X Y at q, for a vector X and a field Y."""
+        return derivative(Y, self.q, X) + np.einsum("ijk,j,k->i", self.christoffel, X, Y(self.q))
+
+    def constrained(self, X, Y):
+        """∇_X Y + (∇_X P⊥)(Y), eq. (6)."""
+        nabla = self.nabla(X, Y)
+        return nabla + self.nabla(X, lambda q: self.complement(q) @ Y(q)) - self.complement(self.q) @ nabla
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_theorem_3_2_is_equation_6_metric_and_has_the_torsion_of_its_frame(name):
+    """In numbers, so also where the formulas of eq. (6) are too long to be written."""
+    mechanism = MECHANISMS[name]
+    k, e, model = mechanism.rank, derive(mechanism), Model(mechanism)
+    # The steps of long equations take the place of common subexpressions.
+    function = sp.lambdify(
+        [*e.coordinates, *e.parameters], e.christoffel.tolist(), cse=lambda written: (list(e.definitions), written)
+    )
+    _, q, _, _ = next(random_states(mechanism))
+    gamma = np.array(function(*q, *mechanism.parameters.values()), dtype=float).reshape(k, k, k)
+    connection = InNumbers(mechanism, q)
+    inertia = connection.inertia(q)
+    fields = [lambda q, unit=unit: model.velocity(q, unit) for unit in np.eye(k)]
+    frame = np.array([field(q) for field in fields])
+    norms = np.diag(frame @ inertia @ frame.T)
+    # Differences over steps of 0.01 err by some 1e-12 of the seventh derivatives, which are large in long frames.
+    tolerance = 1e-7 * max(1.0, np.abs(frame).max() ** 4)
+    for i, X in enumerate(frame):
+        for j, field in enumerate(fields):
+            constrained = connection.constrained(X, field)
+            np.testing.assert_allclose(gamma[:, i, j] @ frame, constrained, rtol=0, atol=tolerance)
+            bracket = derivative(field, q, X) - derivative(fields[i], q, frame[j])
+            torsion = (gamma[:, i, j] - gamma[:, j, i]) * norms
+            np.testing.assert_allclose(torsion, frame @ inertia @ bracket, rtol=0, atol=tolerance)
+        lowered = gamma[:, i, :] * norms[:, None]  # <<∇̃_X X_j, X_k>> at [k, j]
+        rates = [derivative(lambda q, f=f: f(q) @ connection.inertia(q) @ f(q), q, X) for f in fields]
+        np.testing.assert_allclose(lowered + lowered.T, np.diag(rates), rtol=0, atol=tolerance)
