@@ -83,9 +83,9 @@ def test_shifts_of_the_rotor():
         assert invariance(CATALOGUE["snakeboard"], shift, frame)
     result = invariance(CATALOGUE["roller_racer"], shift)
     assert not result
-    assert set(result.broken) == {"constraints"}
+    assert set(result.broken) == {"constraints", "drag"}
     result = invariance(CATALOGUE["roller_racer"], shift, "paper")
-    assert set(result.broken) == {"constraints", "vector field 1", "vector field 2"}
+    assert set(result.broken) == {"constraints", "drag", "vector field 1", "vector field 2"}
 
 
 BOARD = CATALOGUE["snakeboard"]
