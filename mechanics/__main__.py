@@ -81,7 +81,7 @@ def catalogue() -> Iterator[str]:
     """A line on each mechanism of the catalogue."""
     width = max(map(len, names()))
     for m in map(get, names()):
-        numbers = f"{m.n} coordinates, {m.rank} velocities, {len(m.controls)} controls"
+        numbers = f"{m.n} coordinates, {m.rank} velocities, controls: {len(m.controls)}"
         yield f"{m.name:{width}}  {numbers}: {m.citation.split(';')[0]}"
 
 
