@@ -39,6 +39,7 @@ __all__ = ["ReducedEquations", "derive", "reduce"]
 
 Number = Any  # an element of the arithmetic at work: `Element` or `Value`
 Vector = list[Number]
+Move = tuple[tuple[tuple[sp.Symbol, Number], ...], Number]  # a direction, and how fast it turns the heading
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,7 @@ class _Reduction:
 
     def __init__(self, mechanism: Mechanism, rows: Matrix | None, drag: bool, exact: bool) -> None:
         self.mechanism = mechanism
+        self.exact = exact
         self.coefficients = tuple(mechanism.drag) if drag else ()
         n, k = mechanism.n, mechanism.rank
         symbols = mechanism.symbols
@@ -190,7 +192,7 @@ class _Reduction:
         self.norms = [self._dot(row, m) for row, m in zip(self.N, self.MN, strict=True)]  # |N_i|^2
         self.n, self.k = n, k
         self.squared_norms = [g * g * s for g, s in zip(self.scales, self.norms, strict=True)]
-        self.directions = [self._direction(row) for row in self.N]
+        self.moves = [self._move(row) for row in self.N]
 
     # -- the pieces of Theorem 3.2 -------------------------------------------------------------
 
@@ -198,7 +200,7 @@ class _Reduction:
         """Γ̃^k_ij as [k][i][j]."""
         k, one, g = self.k, self.algebra.one, self.scales
         gamma = [[[self.algebra.zero] * k for _ in range(k)] for _ in range(k)]
-        inertia = [self._along_inertia(i) for i in range(k)]
+        inertia = [self._change_of_inertia(move) for move in self.moves]
         for i in range(k):
             for j in range(k):
                 gamma[j][i][j] = self._stretch(i, j)
@@ -218,7 +220,7 @@ class _Reduction:
     def _covariant(self, i: int, j: int, k: int, inertia: list[list[Vector]]) -> Number:
         """<<∇_N_i N_j, N_k>> = <<DN_j N_i, N_k>> + Γ_acd N_k^a N_i^c N_j^d."""
         N = self.N
-        total = self._dot(self._along_field(i, N[j]), self.MN[k])
+        total = self._dot(self._change(N[j], self.moves[i]), self.MN[k])
         # First-kind symbols 2 Γ_acd = ∂_c M_ad + ∂_d M_ac - ∂_a M_cd, contracted
         second = self._form(inertia[i], N[k], N[j]) + self._form(inertia[j], N[k], N[i])
         second = second - self._form(inertia[k], N[i], N[j])
@@ -246,37 +248,58 @@ class _Reduction:
         one = self.algebra.one
         return value * (one / self.scales[k]) * (one / self.norms[k]) if value else value
 
+    def geodesic(self) -> Vector:
+        """-Γ̃^k_ij v^i v^j as [k] without the Γ̃: -<<∇_W W, X_k>>/|X_k|^2 with W = v^i X_i, v constant.
+
+        For the tape, on which a sum over i and j cannot be simplified: vectors are cheaper than their products.
+        """
+        v = [self.algebra.convert(symbol) for symbol in self.v]
+        W = [self._dot(v, list(component)) for component in zip(*self.X, strict=True)]
+        move = self._move(W)
+        rates, moved = self._change(W, move), [self._dot(row, W) for row in self._change_of_inertia(move)]
+        # Γ_acd W^c W^d = (∂_W M W)_a - 1/2 ∂_a M(W, W)
+        second = [a - b for a, b in zip(moved, self._pull(W), strict=True)]
+        return [-self._per_norm(k, self._dot(rates, self.MN[k]) + self._dot(second, self.N[k])) for k in range(self.k)]
+
+    def _pull(self, W: Vector) -> Vector:
+        """1/2 ∂_a M(W, W) as [a]."""
+        axes = [[self.algebra.one if a == b else self.algebra.zero for b in range(self.n)] for a in range(self.n)]
+        return [self.half * self._form(self._change_of_inertia(self._move(axis)), W, W) for axis in axes]
+
     # -- calculus with the symmetry ------------------------------------------------------------
 
     def _along(self, i: int, function: Number) -> Number:
         """Derivative of an invariant function along N_i."""
-        return self.algebra.along(function, self.directions[i])
+        return self.algebra.along(function, self.moves[i][0])
 
-    def _direction(self, field: Vector) -> tuple[tuple[sp.Symbol, Number], ...]:
-        """What a field does to the coordinates that invariant functions see: pairs (coordinate, rate).
+    def _move(self, field: Vector) -> Move:
+        """What a field does to what invariant functions see: pairs (coordinate, rate), and how it turns the heading.
 
         At the identity the fibre's derivatives come from the symmetry: an invariant function has no
         derivative along ∂x, ∂y and ∂θ + Σ ∂(turning) + x∂y - y∂x, so ∂θ = -Σ ∂(turning).
         """
-        rates = dict(zip(self.q, field, strict=True))
+        rates, turn = dict(zip(self.q, field, strict=True)), self.algebra.zero
         if s := self.symmetry:
+            turn = field[s.heading]
             for c in s.turning:
-                rates[self.q[c]] = rates[self.q[c]] - field[s.heading]
+                rates[self.q[c]] = rates[self.q[c]] - turn
             for c in (s.x, s.y, s.heading):
                 del rates[self.q[c]]
-        return tuple((symbol, rate) for symbol, rate in rates.items() if rate)
+        return tuple((symbol, rate) for symbol, rate in rates.items() if rate), turn
 
-    def _along_field(self, i: int, field: Vector) -> Vector:
-        """DN N_i, the components' derivatives along N_i: those of an invariant field also turn with the heading."""
-        rates = [self._along(i, e) if e else e for e in field]
-        if (s := self.symmetry) and (turn := self.N[i][s.heading]):
+    def _change(self, field: Vector, move: Move) -> Vector:
+        """Derivatives of a field's components: those of an invariant field also turn with the heading."""
+        direction, turn = move
+        rates = [self.algebra.along(e, direction) if e else e for e in field]
+        if (s := self.symmetry) and turn:
             rates[s.x], rates[s.y] = rates[s.x] - turn * field[s.y], rates[s.y] + turn * field[s.x]
         return rates
 
-    def _along_inertia(self, i: int) -> list[Vector]:
-        """Derivatives of M's entries along N_i, likewise: ∂θ M = J M - M J with J: e_x -> e_y -> -e_x."""
-        rates = [[self._along(i, e) if e else e for e in row] for row in self.M]
-        if (s := self.symmetry) and (turn := self.N[i][s.heading]):
+    def _change_of_inertia(self, move: Move) -> list[Vector]:
+        """Derivatives of M's entries, likewise: ∂θ M = J M - M J with J: e_x -> e_y -> -e_x."""
+        direction, turn = move
+        rates = [[self.algebra.along(e, direction) if e else e for e in row] for row in self.M]
+        if (s := self.symmetry) and turn:
             for a in range(self.n):
                 for c, entry in ((s.x, self.M[a][s.y]), (s.y, -self.M[a][s.x])):
                     rates[a][c] = rates[a][c] - turn * entry
@@ -332,9 +355,11 @@ class _Reduction:
         covectors = [self._turn(row) for row in self.projection()]
         v, u = ([Product(factors={s: Fraction(1)}) for s in symbols] for symbols in (self.v, self.u))
 
+        geodesic = [] if self.exact else self.geodesic()
+
         def acceleration(up: int) -> sp.Expr:
-            terms = []
-            for i in range(k):
+            terms = [product(geodesic[up])] if geodesic else []
+            for i in range(k) if self.exact else ():
                 for j in range(i + 1):
                     both = gamma[up][i][j] if i == j else gamma[up][i][j] + gamma[up][j][i]
                     terms.append(minus * product(both) * v[j] * v[i])
@@ -381,4 +406,5 @@ def _samples(mechanism: Mechanism) -> dict[str, Any]:
     count = 200
     numbers = {**mechanism.parameters, **mechanism.drag}
     values = {name: value * rng.uniform(0.9, 1.1, count) for name, value in numbers.items()}
-    return values | {name: rng.uniform(-np.pi, np.pi, count) for name in mechanism.coordinates}
+    moving = (*mechanism.coordinates, *(f"v{i + 1}" for i in range(mechanism.rank)))
+    return values | {name: rng.uniform(-np.pi, np.pi, count) for name in moving}

@@ -15,6 +15,7 @@ from oracles import multiplier_acceleration
 
 import mechanics
 from mechanics import Mechanism, Model
+from mechanics.compiler.codegen import needed
 from mechanics.geometry import reduce
 from mechanics.geometry.reduction import derive
 
@@ -204,9 +205,9 @@ def test_theorem_3_2_is_equation_6_metric_and_has_the_torsion_of_its_frame(name)
     mechanism = MECHANISMS[name]
     k, e, model = mechanism.rank, derive(mechanism), Model(mechanism)
     # The steps of long equations take the place of common subexpressions.
-    function = sp.lambdify(
-        [*e.coordinates, *e.parameters], e.christoffel.tolist(), cse=lambda written: (list(e.definitions), written)
-    )
+    steps = list(needed(sp.flatten(e.christoffel), e.definitions).items())
+    symbols = [*e.coordinates, *e.parameters]
+    function = sp.lambdify(symbols, e.christoffel.tolist(), cse=lambda written: (steps, written))
     _, q, _, _ = next(random_states(mechanism))
     gamma = np.array(function(*q, *mechanism.parameters.values()), dtype=float).reshape(k, k, k)
     connection = InNumbers(mechanism, q)
