@@ -311,15 +311,9 @@ class Algebra:
         if e.is_Rational:
             return Element(self, self.ring(int(e.p)), self.ring(int(e.q)))
         if e.is_Add:
-            total = self.zero
-            for term in e.args:
-                total = total + self.convert(term)
-            return total
+            return sum(map(self.convert, e.args), self.zero)
         if e.is_Mul:
-            total = self.one
-            for term in e.args:
-                total = total * self.convert(term)
-            return total
+            return math.prod(map(self.convert, e.args), start=self.one)
         if e.is_Pow and e.exp.is_Integer:
             return self.convert(e.base) ** int(e.exp)
         if e.is_Pow and e.exp.is_Rational and e.exp.q == 2:

@@ -9,6 +9,7 @@ one of a few random points, as the terms of an identity between analytic functio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
@@ -110,15 +111,9 @@ class Tape:
         if e.is_Rational:
             return Value(self, Product(Fraction(int(e.p), int(e.q))), float(e) * self.one.numbers)
         if e.is_Add:
-            total = self.zero
-            for term in e.args:
-                total = total + self.convert(term)
-            return total
+            return sum(map(self.convert, e.args), self.zero)
         if e.is_Mul:
-            total = self.one
-            for factor in e.args:
-                total = total * self.convert(factor)
-            return total
+            return math.prod(map(self.convert, e.args), start=self.one)
         if e.is_Pow and e.exp.is_Rational and e.exp.q <= 2:
             base = self.convert(e.base)
             return (base if e.exp.q == 1 else self._named([base])) ** Fraction(int(e.exp.p), int(e.exp.q))
