@@ -4,7 +4,7 @@ import random
 
 import pytest
 from sympy import ZZ
-from sympy.polys.rings import ring
+from sympy.polys.rings import PolyElement, ring
 
 from mechanics.geometry.polynomials import factor_list
 
@@ -35,3 +35,10 @@ def test_factors_multiply_to_the_polynomial_and_are_those_of_sympy(seed):
     assert product == poly
 
     assert (content, sorted(found, key=str)) == (poly.factor_list()[0], sorted(poly.factor_list()[1], key=str))
+
+
+def test_an_irreducible_quadratic_needs_no_random_numbers(monkeypatch):
+    """SymPy's own method, which draws them and then may take minutes, is not asked."""
+    monkeypatch.setattr(PolyElement, "factor_list", None)
+    poly = x**2 * y**2 + z**2 * w**2 + x**2 + 1
+    assert factor_list(-3 * poly) == (-3, [(poly, 1)])
