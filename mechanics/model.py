@@ -137,7 +137,8 @@ def _source(mechanism: Mechanism, rows: Any, drag: bool) -> str:
     """Generate the NumPy module of a mechanism in a frame."""
     import sympy as sp
 
-    from mechanics.compiler.codegen import BACKENDS, Program, needed
+    from mechanics.compiler.backends import BACKENDS
+    from mechanics.compiler.codegen import Program, needed
     from mechanics.geometry.reduction import derive
 
     equations: ReducedEquations = derive(mechanism, rows, drag=drag)

@@ -12,10 +12,10 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from mechanics.expressions import evaluate, unknown_name
+from mechanics.expressions import unknown_name
 from mechanics.model import Model
-from nhenv import tasks
-from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
+from nhenv.configuration import Configuration
+from nhenv.registration import MechanismLike, TaskLike
 from nhenv.replay import Replay
 from nhenv.scene import BAD_ACTION, HISTORY_FULL, TERMINATED, Scene
 
@@ -129,6 +129,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         reset_noise_scale: half-width of the initial angles, in rad.
         backend: "numba", or "numpy" for kernels that are interpreted: nothing is compiled, each step
             takes some fifty times as long, and a debugger can walk through it.
+        whole_state: whether every coordinate is integrated in every step, not only those that something depends on;
+            `q` is complete either way, but worked out when asked for without this.
         render_mode: None; these environments do not draw.
         **weights: the task's weights. Forward: `forward_reward_weight=1.0`. Velocity: `velocity_cost_weight=2.0`,
             `sideways_cost_weight=0.2`. Goal: `progress_reward_weight=1.0`, `time_cost_weight=0.5`,
@@ -154,36 +156,33 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         substeps: int | None = None,
         reset_noise_scale: float = 0.05,
         backend: str = "numba",
+        whole_state: bool = False,
         render_mode: str | None = None,
         **weights: float,
     ) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}: these environments do not draw")
-        if substeps is not None and (isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1):
-            raise ValueError(f"substeps must be a positive whole number or None, got {substeps!r}")
-        self.mechanism = in_the_plane(as_mechanism(mechanism))
-        self.task = tasks.get(task)
-        if problem := unfit(self.mechanism, self.task):
-            raise ValueError(problem)
-        self.params = self.mechanism.resolve(params)
-        self.dt = _positive("dt", dt)
-        self.torque_limits = self._torque_limits(torque_limits)
-        self.joint_limits = self._joint_limits(joint_limits)
-        self.reset_noise_scale = self._noise(reset_noise_scale)
-        self.frame = frame
-        self._scene = Scene(
-            self.mechanism,
-            self.task,
+        self._configuration = configuration = Configuration(
+            mechanism,
+            task,
+            params=params,
+            dt=dt,
+            torque_limits=torque_limits,
+            joint_limits=joint_limits,
             frame=frame,
-            stops=bool(self.joint_limits),
             integrator=integrator,
             substeps=substeps,
+            reset_noise_scale=reset_noise_scale,
             backend=backend,
+            whole_state=whole_state,
+            render_mode=render_mode,
+            **weights,
         )
-        self._numbers = self._kernel_parameters(weights)
-        kernel = self._scene.kernel
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(self.mechanism.controls),), np.float32)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (len(kernel.OBSERVATION),), np.float32)
+        self.mechanism, self.task = configuration.mechanism, configuration.task
+        self.params, self.dt = configuration.params, configuration.dt
+        self.torque_limits, self.joint_limits = configuration.torque_limits, configuration.joint_limits
+        self.reset_noise_scale, self.frame = configuration.reset_noise_scale, frame
+        self._scene = configuration.scene
+        self.action_space = configuration.action_space
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (len(self._scene.kernel.OBSERVATION),), np.float32)
         self._blank = self._memory = self._new_memory(self._scene)
         self._start: tuple[Array, Array] | None = None  # (q, v) at reset
         self._targets: dict[str, float] = {}
@@ -200,17 +199,20 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         for key in options or {}:
             if key not in ("q", "qdot", "target"):
                 raise ValueError(f"reset options: {unknown_name('option', str(key), ('q', 'qdot', 'target'))}")
-        q = np.zeros(self.mechanism.n)
-        q[self._noisy] = self.np_random.uniform(-self.reset_noise_scale, self.reset_noise_scale, len(self._noisy))
-        v = np.zeros(self.mechanism.rank)
-        targets = self.task.draw(self.np_random, self._given_targets(options) if options else {})
+        given = self._configuration.targets_given(options) if options else {}
+        drawn = self.np_random.random(self._scene.draws)
+        values = [given.get(name, math.nan) for name in self.task.targets]
+        begun = self._scene.kernel.begin(drawn, self.reset_noise_scale, np.array(values), self._constants(self._blank))
+        q, v = np.zeros(self.mechanism.n), np.zeros(self.mechanism.rank)
+        q[self._noisy] = begun[: len(self._noisy)]
         if options:
-            q = self._given(options, "q", q)
-            self._check_stops(q)
+            if "q" in options:
+                q = self._configuration.state_given(options, "q")
+                self._configuration.check_stops(q)
             if "qdot" in options:
-                v = self._model.feasible(q, self._given(options, "qdot", np.zeros_like(q)))
+                v = self._model.feasible(q, self._configuration.state_given(options, "qdot"))
         self._memory, self._start = self._blank.copy(), (q, v)
-        self._targets = {name: targets[name] for name in self._scene.targets}
+        self._targets = dict(zip(self._scene.targets, map(float, begun[len(self._noisy) :]), strict=True))
         self._scene.put(self._memory, q, v)
         self._scene.aim(self._memory, self._targets)
         self._replay = None
@@ -221,7 +223,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Hold the torques `action * torque_limits` for `dt` seconds."""
         try:
             response = self._respond(self._memory, action)
-        except (AttributeError, TypeError, ValueError):  # not an array of m numbers: say so, or make it one
+        except TypeError:  # not an array of m numbers: say so, or make it one
             response = self._respond(self._memory, self._as_action(action))
         return self._exception(response, action) if response[2] else response
 
@@ -258,9 +260,9 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Kinetic plus potential energy in J."""
         return float(self._model.energy(*self._whole_state()))
 
-    @cached_property
+    @property
     def _model(self) -> Model:
-        return Model(self.mechanism, self.params, self.frame)
+        return self._configuration.model
 
     def _whole_state(self) -> tuple[Array, Array]:
         """(q, v), with what the scene prunes worked out from what happened since reset."""
@@ -295,7 +297,6 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Everything but the compiled kernel, which is loaded again."""
         state = dict(self.__dict__)
         del state["_respond"]
-        state.pop("_model", None)
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -304,14 +305,20 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._bind()
 
     def _new_memory(self, scene: Scene) -> Array:
-        return scene.new_memory(self._numbers, self.torque_limits, self.joint_limits.values())
+        numbers = self._configuration.numbers(self.params)
+        return scene.new_memory(numbers, self.torque_limits, self.joint_limits.values())
+
+    def _constants(self, memory: Array) -> Array:
+        return memory[slice(*self._scene.kernel.MEMORY["k"])]
 
     def _observation(self) -> NDArray[np.float32]:
-        kernel = self._scene.kernel
-        state = self._memory[slice(*kernel.MEMORY["state"])].tolist()
-        observe = getattr(kernel.observe, "py_func", kernel.observe)  # compiling it alone would take longer
-        constants = self._memory[slice(*kernel.MEMORY["k"])]
-        return np.array(observe(*state, *self._targets.values(), constants), dtype=np.float32)
+        observation = np.empty(len(self._scene.kernel.OBSERVATION), np.float32)
+        self._scene.kernel.look(self._memory, observation)
+        return observation
+
+    @cached_property
+    def _noisy(self) -> list[int]:
+        return [self.mechanism.coordinates.index(name) for name in self._scene.noisy]
 
     def _as_action(self, action: ArrayLike) -> Array:
         shape, controls = self.action_space.shape, ", ".join(self.mechanism.controls)
@@ -338,108 +345,6 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         info["diverged"] = True
         return observation, reward, True, False, info
 
-    # -- arguments -----------------------------------------------------------------------------
-
-    @cached_property
-    def _noisy(self) -> list[int]:
-        """Coordinates that are random at reset: the joints with stops, or else the heading."""
-        names = tuple(self.mechanism.joint_limits) or self.mechanism.fibre[2:]
-        return [self.mechanism.coordinates.index(name) for name in names]
-
-    def _kernel_parameters(self, weights: Mapping[str, float]) -> dict[str, float]:
-        values = dict(self.task.weights)
-        for name, value in weights.items():
-            if name not in values:
-                raise TypeError(f"{type(self).__name__}: {unknown_name('argument', name, values)}")
-            values[name] = _number(name, value)
-            if not math.isfinite(values[name]):
-                raise ValueError(f"{name} must be finite, got {value}")
-        forward = float(np.sign(evaluate(self.mechanism.forward, self.params)))
-        if forward == 0:
-            raise ValueError(
-                f"{self.mechanism.name}: with these parameters {self.mechanism.forward} = 0, and its gaits drive it "
-                "neither way; change a parameter"
-            )
-        return values | self.params | {"dt": self.dt, "forward": forward}
-
-    def _torque_limits(self, given: Mapping[str, float] | ArrayLike | None) -> Array:
-        controls = self.mechanism.controls
-        values = {control: self.mechanism.torque_limits.get(control, 1.0) for control in controls}
-        if isinstance(given, Mapping):
-            for name, value in given.items():
-                if name not in values:
-                    raise ValueError(f"torque_limits: {unknown_name('control', str(name), controls)}")
-                values[name] = value
-        elif given is not None:
-            array = np.asarray(given, dtype=float)
-            if array.shape not in ((), (len(controls),)):
-                raise ValueError(f"torque_limits must be one number for each of {', '.join(controls)}, got {given!r}")
-            values = dict(zip(controls, np.broadcast_to(array, len(controls)), strict=True))
-        return np.array([_positive(f"torque limit of {name}", value) for name, value in values.items()])
-
-    def _joint_limits(self, given: bool | Mapping[str, float]) -> dict[str, float]:
-        values = dict(self.mechanism.joint_limits)
-        if isinstance(given, bool | np.bool_):
-            return values if given else {}
-        if not isinstance(given, Mapping):
-            raise ValueError(f"joint_limits must be True, False or a mapping of angles in rad, got {given!r}")
-        for name, value in given.items():
-            if name not in values:
-                raise ValueError(f"joint_limits: {unknown_name('joint', str(name), values)}")
-            values[name] = _positive(f"joint limit of {name}", value)
-        return values
-
-    def _noise(self, scale: float) -> float:
-        smallest, number = min(self.joint_limits.values(), default=math.inf), _number("reset_noise_scale", scale)
-        if not 0 <= number < smallest:
-            raise ValueError(f"reset_noise_scale must be at least 0 and below the stops at {smallest} rad, got {scale}")
-        return number
-
-    def _given_targets(self, options: Options) -> dict[str, float]:
-        given = options.get("target", {})
-        if not isinstance(given, Mapping):
-            raise ValueError(f"reset option 'target' must map targets to numbers, got {given!r}")
-        values = {}
-        for name, value in given.items():
-            if name not in self.task.targets:
-                raise ValueError(f"reset option 'target': {unknown_name('target', str(name), self.task.targets)}")
-            values[name] = _number(f"reset option 'target': {name}", value)
-            if not math.isfinite(values[name]):
-                raise ValueError(f"reset option 'target': {name} must be finite, got {value}")
-        return values
-
-    def _given(self, options: Options, key: str, default: Array) -> Array:
-        values = np.array(options.get(key, default), dtype=float)
-        names = ", ".join(self.mechanism.coordinates)
-        if values.shape != default.shape:
-            raise ValueError(f"reset option {key!r} must have shape {default.shape} ({names}), got {values.shape}")
-        if not np.isfinite(values).all():
-            raise ValueError(f"reset option {key!r} must be finite, got {values.tolist()}")
-        return values
-
-    def _check_stops(self, q: Array) -> None:
-        for joint, limit in self.joint_limits.items():
-            angle = q[self.mechanism.coordinates.index(joint)]
-            if abs(angle) > limit:
-                raise ValueError(
-                    f"reset option 'q' has {joint} = {angle}, beyond its stop at {limit} rad; "
-                    "make the environment with joint_limits=False to go there"
-                )
-
 
 def _refuse(memory: Array, action: Any) -> Response:
     raise ResetNeeded("step() was called before reset(); call reset() to start an episode")
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number, got {value!r}") from None
-
-
-def _positive(name: str, value: Any) -> float:
-    number = _number(name, value)
-    if not (math.isfinite(number) and number > 0):
-        raise ValueError(f"{name} must be positive and finite, got {value!r}")
-    return number

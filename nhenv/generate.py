@@ -1,54 +1,51 @@
-"""From a scene to the source of its kernel: the symbolic half of `nhenv.scene`.
+"""From a scene to expressions, and from these to the functions that its kernels share.
 
-Imported only when the cache has no kernel for a scene, so it may import what it likes.
+The symbolic half of `nhenv.scene`: imported only when the cache has no kernel for a scene, so it may import what it
+likes. `nhenv.one_kernel` and `nhenv.rows_kernel` put these functions around one environment and around many.
 """
 
 from __future__ import annotations
 
 import inspect
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import sympy as sp
 
 from mechanics.compiler import stops
-from mechanics.compiler.codegen import BACKENDS, Program, operation_count
-from mechanics.compiler.dataflow import Dataflow, analyse, initial
+from mechanics.compiler.backends import BACKENDS, Backend
+from mechanics.compiler.codegen import Program, integrated, operation_count
+from mechanics.compiler.dataflow import analyse, initial
 from mechanics.compiler.integrators import Method, method
 from mechanics.expressions import ExpressionError, to_sympy
 from mechanics.geometry.reduction import ReducedEquations, derive
 from mechanics.geometry.symmetry import planar_symmetry
 from nhenv.observation import default_observation
-from nhenv.scene import BAD_ACTION, DIVERGED, HISTORY_FULL, RUNNING, TERMINATED, Scene
+from nhenv.scene import Scene
 from nhenv.tasks import Task
 
-__all__ = ["kernel_source"]
+__all__ = ["Generator", "included", "items", "label"]
 
 # Method and substeps where the graph has no core, and where it has one: the cheapest that keeps
 # 10 s of the held-torque reference trajectories within 1e-7 (tests/nhenv/test_references.py).
-LAYERED = ("gauss4", 1)
-CORE = ("dop853", 2)
-
-# Holds remembered when a state is pruned, so that `env.q` can still be worked out when asked for.
-HISTORY = 512
+LAYERED = ("lobatto6", 1)
+CORE = ("verner9", 2)
 
 TERMINATED_NOW = sp.Symbol("_terminated")  # 1 if the task ends the episode with this step, else 0
 
 
-def kernel_source(scene: Scene) -> str:
-    """Source of a scene's kernel module."""
-    return _Generator(scene, derive(scene.mechanism, scene.frame)).module()
-
-
-class _Generator:
+class Generator:
     """Everything symbolic about one scene."""
 
-    def __init__(self, scene: Scene, equations: ReducedEquations) -> None:
-        self.scene, self.equations = scene, equations
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.equations = equations = derive(scene.mechanism, scene.frame)
         self.backend = BACKENDS[scene.backend]
         self.actions = [sp.Symbol(f"_a_{control}") for control in scene.mechanism.controls]
         self.joints = [_joint(equations, name) for name in scene.joints]
         self.free = [sp.Symbol(f"_free_{angle.name}") for angle, _ in self.joints]
+        self.held = (*equations.controls, *self.free)  # constant over a step
         observation, judgement, ending = self._task_expressions()
         velocities = dict(zip(equations.coordinates, equations.velocity, strict=True))
         accelerations = dict(zip(equations.pseudo_velocities, equations.acceleration, strict=True))
@@ -61,9 +58,12 @@ class _Generator:
         self.motion = {**self.joint_rates, **joint_accelerations}
         self.observation, self.judgement, self.ending = list(observation), list(judgement), list(ending)
         self.targets = self._targets([*observation.values(), *judgement.values(), *ending.values()])
-        outputs = {**_integrated(self.flow), **observation, **judgement, **ending, **self.motion}
+        judged = {symbol for expression in judgement.values() for symbol in expression.free_symbols}
+        self.remembered = [state for state in self.flow.states if initial(state) in judged]
+        self.rules = self._rules()
+        self.method, self.substeps = self._method()
+        outputs = {**integrated(self.flow), **observation, **judgement, **ending, **self.motion, **self.rules}
         self.program = Program(outputs, [sp.Symbol(name) for name in scene.parameters], equations.definitions)
-        self.memory = self._memory()
 
     def _task_expressions(self) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr], dict[str, sp.Expr]]:
         """Observation, judgement (reward terms, then info) and termination as expressions in the states."""
@@ -107,34 +107,21 @@ class _Generator:
         used = {symbol for output in outputs for symbol in output.free_symbols}
         return [symbol for symbol in map(sp.Symbol, names) if symbol in used]
 
+    def _rules(self) -> dict[str, sp.Expr]:
+        """Targets that follow from those before them, as expressions."""
+        task = self.scene.task
+        texts = task.targets if task else {}
+        scope = {name: sp.Symbol(name) for name in texts}
+        return {
+            f"target:{n}": _read(task, "targets", t, scope) for n, t in texts.items() if task and isinstance(t, str)
+        }
+
     def _wanted(self, rates: Iterable[sp.Symbol], outputs: list[sp.Expr]) -> list[sp.Expr]:
         """What must be known after a step; without a task, everything."""
-        if self.scene.task is None:
+        if self.scene.task is None or self.scene.whole_state:
             return list(rates)
         now = {initial(state): state for state in rates}
         return [*(output.xreplace(now) for output in outputs), *(angle for angle, _ in self.joints)]
-
-    def _memory(self) -> dict[str, tuple[int, int]]:
-        """Part of the memory -> its first and last place."""
-        n, m, joints = len(self.flow.states), len(self.actions), len(self.joints)
-        history = HISTORY if self.flow.pruned else 0
-        sizes = {
-            "state": n, "limit": m, "stop": joints, "dt": 1, "k": len(self.program.constants),
-            # for the way through an impact
-            "control": m, "new": n, "free": joints, "work": 2 * joints, "hits": joints,
-            "count": min(history, 1), "history": history * m,
-        }  # fmt: skip
-        if self.targets:
-            sizes["target"] = len(self.targets)
-        places, offset = {}, 0
-        for name, size in sizes.items():
-            places[name] = (offset, offset + size)
-            offset += size
-        return places
-
-    def _places(self) -> dict[str, int]:
-        """Part of the memory -> its first place."""
-        return {name: start for name, (start, _) in self.memory.items()}
 
     def _method(self) -> tuple[Method, int]:
         """Integrator and substeps: as asked, or the default for this graph."""
@@ -145,193 +132,126 @@ class _Generator:
 
     # -- text ----------------------------------------------------------------------------------
 
-    def module(self) -> str:
-        """Text of the generated module."""
-        program, flow, backend = self.program, self.flow, self.backend
-        chosen, substeps = self._method()
+    def tables(self, **more: object) -> str:
+        """Names and places, so that a loaded kernel needs nothing symbolic."""
+        tables = {
+            "STATES": tuple(state.name for state in self.flow.states),
+            "PRUNED": tuple(state.name for state in self.flow.pruned),
+            "OBSERVATION": tuple(label(name) for name in self.observation),
+            "JUDGEMENT": tuple(label(name) for name in self.judgement),
+            "TARGETS": tuple(target.name for target in self.targets),
+        } | more
+        return "".join(f"{name} = {value!r}\n" for name, value in tables.items())
+
+    def constants(self) -> str:
+        """Source of `constants`: the parameters of a scene to what the functions take as `_k`."""
+        return self.program.constants_function("constants", [sp.Symbol(name) for name in self.scene.parameters])
+
+    def functions(self, backend: Backend, substeps: int, carried: Mapping[str, sp.Expr] | None = None) -> list[str]:
+        """Source of what a row of numbers goes through, whether alone or beside others."""
+        program, flow = self.program, self.flow
         states, controls = flow.states, self.equations.controls
         before = [initial(state) for state in states]
         judged = (*states, *before, *self.actions, *self.targets, *([TERMINATED_NOW] if self.ending else []))
         parts = [
-            f'"""{self._title(chosen, substeps)}"""\n\n{backend.header}',
-            self._tables(),
-            program.constants_function("constants", [sp.Symbol(name) for name in self.scene.parameters]),
-            program.step_function("advance_states", flow, chosen, substeps, (*controls, *self.free), backend),
+            program.step_function("advance_states", flow, self.method, substeps, self.held, backend, carried),
             program.function("observe", (*states, *self.targets), self.observation, backend),
             program.function("judge", judged, self.judgement, backend),
         ]
         if self.ending:
             parts.append(program.function("ends", (*states, *self.targets), self.ending, backend))
         if self.joints:
-            constants = "".join(f"{name} = {getattr(stops, name)!r}\n" for name in stops.CONSTANTS)
             parts += [
                 program.function("joint_rates", states, list(self.joint_rates), backend),
                 program.function("move_joints", (*states, *controls), list(self.motion), backend),
-                constants,
-                *self._array_forms(),
-                *(backend.decorator + inspect.getsource(f).replace(": Array", "") for f in stops.SOURCES),
+                self._clear_joints(backend),
             ]
-        parts += [self._step(), self._respond()]
-        return "\n\n".join(parts)
+        return [*parts, *self._start(backend)]
 
-    def _title(self, chosen: Method, substeps: int) -> str:
+    def _clear_joints(self, backend: Backend) -> str:
+        """Whether a free flight met no stop, from both its ends; where that is not sure, the answer is no.
+
+        A joint that turned was farthest out at the parabola's peak if its rate changes evenly. Where only states exact
+        in time do so, twice that excursion allows for the rest: the cubic's share is a small part of it for holds
+        shorter than the motion's own times.
+        """
+        states = [state.name for state in self.flow.states]
+        old, new = (", ".join(f"{name}__{when}" for name in states) for when in ("old", "new"))
+        frees, stops_ = ([f"_{kind}_{angle.name}" for angle, _ in self.joints] for kind in ("free", "stop"))
+        lines = [f"rates_old = joint_rates({old}, _k)", f"rates_new = joint_rates({new}, _k)"]
+        clear = []
+        for j, (angle, rate) in enumerate(self.joints):
+            margin = repr(0.5 * (1 + 1e-9)) if angle in self.flow.solutions else "1.0"
+            lines += [
+                f"room = {stops_[j]} - fabs({angle.name}__old)",
+                f"excursion = {margin}*dt*rates_old[{j}]*rates_old[{j}]",
+                f"within = excursion < room*fabs(rates_old[{j}] - rates_new[{j}])",
+                f"within = within | ({rate.name}__old*{rate.name}__new >= 0.0)",
+                f"clear_{j} = ({frees[j]} == 0.0) | (within & (fabs({angle.name}__new) < {stops_[j]}))",
+            ]
+            clear.append(f"clear_{j}")
+        body = textwrap.indent("\n".join([*lines, f"return {' & '.join(clear)}"]), "    ")
+        arguments = ", ".join(("dt", old, new, *frees, *stops_, "_k"))
+        return f"{backend.decorator}def clear_joints({arguments}):\n{body}\n"
+
+    def _start(self, backend: Backend) -> list[str]:
+        """Where an episode begins: uniform numbers to coordinates and targets, unless these are given."""
+        task, noisy = self.scene.task, self.scene.noisy
+        rules = task.targets if task else {}
+        parts, lines = [], [f"_q_{name} = -_noise + (_noise + _noise)*_u{i}" for i, name in enumerate(noisy)]
+        draw = len(noisy)
+        known: list[str] = []
+        for name, rule in rules.items():
+            if isinstance(rule, str):
+                arguments = [sp.Symbol(other) for other in known]
+                parts.append(self.program.function(f"_rule_{name}", arguments, [f"target:{name}"], backend))
+                value = f"_rule_{name}({', '.join((*known, '_k'))})[0]"
+            else:
+                low, high = map(float, rule)
+                value, draw = f"{low!r} + {high - low!r}*_u{draw}", draw + 1
+            lines.append(f"{name} = either(_given_{name}, {value})")
+            known.append(name)
+        # Coordinates, then the targets that something depends on.
+        kept = [f"_q_{name}" for name in noisy] + [target.name for target in self.targets]
+        lines.append(f"return ({''.join(f'{name}, ' for name in kept)})")
+        arguments_ = ", ".join((*(f"_u{i}" for i in range(draw)), "_noise", *(f"_given_{n}" for n in rules), "_k"))
+        body = textwrap.indent("\n".join(lines), "    ")
+        return [*parts, f"{backend.decorator}def start({arguments_}):\n{body}\n"]
+
+    def title(self, kind: str) -> str:
+        """What a generated module says of itself."""
         task = self.scene.task.name if self.scene.task else "whole state"
         kinds = ", ".join(f"{layer.kind} ({' '.join(s.name for s in layer.states)})" for layer in self.flow.layers)
         return (
-            f"{self.scene.mechanism.name}, {task}. Generated from the reduced equations; do not edit.\n\n"
+            f"{self.scene.mechanism.name}, {task}, {kind}. Generated from the reduced equations; do not edit.\n\n"
             f"States: {kinds}. Pruned: {' '.join(s.name for s in self.flow.pruned) or 'none'}.\n"
-            f"Integrator: {chosen.name} ({chosen.source}), {substeps} step(s) a hold.\n"
+            f"Integrator: {self.method.name} ({self.method.source}), {self.substeps} step(s) a hold.\n"
             f"{operation_count(self.program)} operations in all rates, observations and rewards together.\n"
         )
 
-    def _tables(self) -> str:
-        """Names and places, so that a loaded kernel needs nothing symbolic."""
+    def stop_functions(self, backend: Backend) -> list[str]:
+        """Source of the way through impacts: `mechanics.compiler.stops` over this scene's `advance` and `motion`."""
+        constants = "".join(f"{name} = {getattr(stops, name)!r}\n" for name in stops.CONSTANTS)
         places = {state: i for i, state in enumerate(self.flow.states)}
-        tables = {
-            "STATES": tuple(state.name for state in self.flow.states),
-            "PRUNED": tuple(state.name for state in self.flow.pruned),
-            "OBSERVATION": tuple(_label(name) for name in self.observation),
-            "ANGLES": tuple(places[angle] for angle, _ in self.joints),
-            "RATES": tuple(places[rate] for _, rate in self.joints),
-            "MEMORY": self.memory,
-            "SIZE": max(end for _, end in self.memory.values()),
-        }
-        if self.targets:
-            tables["TARGETS"] = tuple(target.name for target in self.targets)
-        return "".join(f"{name} = {value!r}\n" for name, value in tables.items())
+        constants += f"ANGLES = {tuple(places[angle] for angle, _ in self.joints)}\n"
+        constants += f"RATES = {tuple(places[rate] for _, rate in self.joints)}\n"
+        pure = included(stops.PURE, backend.inlined())
+        return [constants, *self._array_forms(backend), *pure, *included(stops.SOURCES, backend)]
 
-    def _respond(self) -> str:
-        """Plain Python around `step`: (memory, action) -> what an environment's step returns, all fresh.
-
-        The place of `terminated` has the status if that is not RUNNING. Unpacking by name costs half of
-        what `*action` does, and a literal a third of `dict(zip(...))`.
-        """
-        actions = ", ".join(action.name for action in self.actions)
-        entries = ", ".join(f"{_label(name)!r}: result[{i + 2}]" for i, name in enumerate(self.judgement))
-        call, imports = [f"result = step(memory, observation, {actions})"], "dtype, empty"
-        if not self.backend.decorator:  # NumPy's numbers warn where compiled ones do not, and are no floats
-            call = ["with errstate(all='ignore'):", *(f"    {line}" for line in call), "result = [*map(float, result)]"]
-            imports += ", errstate"
-        lines = [
-            f"{actions}, = action.tolist()",
-            f"observation = empty({len(self.observation)}, FLOAT32)",
-            *call,
-            f"return observation, result[1], result[0] or False, False, {{{entries}}}",
-        ]
-        text = textwrap.indent("\n".join(lines), "    ")
-        return f"from numpy import {imports}\n\nFLOAT32 = dtype('float32')\n\n\ndef respond(memory, action):\n{text}\n"
-
-    def _array_forms(self) -> list[str]:
+    def _array_forms(self, backend: Backend) -> list[str]:
         """`advance` and `motion` over arrays, for the stops."""
         n, m, joints = len(self.flow.states), len(self.actions), len(self.joints)
-        arguments = f"{_items('state', n)}, {_items('control', m)}"
+        state, control, free = items("state", n), items("control", m), items("free", joints)
         return [
-            f"{self.backend.decorator}def advance(h, state, control, free, k, new):\n"
-            f"    {_items('new', n)}, = advance_states(h, {arguments}, {_items('free', joints)}, k)\n",
-            f"{self.backend.decorator}def motion(state, control, k, out):\n"
-            f"    {_items('out', 2 * joints)}, = move_joints({arguments}, k)\n",
+            f"{backend.decorator}def advance(h, state, control, free, k, new):\n"
+            f"{textwrap.indent(self.advance(items('new', n), state, control, free), '    ')}\n",
+            f"{backend.decorator}def motion(state, control, k, out):\n"
+            f"    {items('out', 2 * joints)}, = move_joints({state}, {control}, k)\n",
         ]
 
-    def _step(self) -> str:
-        """The kernel: unpack, clip, hold, check, judge."""
-        # Names of the user's get two underscores in the middle: they cannot meet those of the kernel.
-        states = [state.name for state in self.flow.states]
-        old, new = (f"{', '.join(f'{name}__{when}' for name in states)}, " for when in ("old", "new"))
-        controls = [f"{control.name}__u" for control in self.equations.controls]
-        place = self._places()
-        state = _items("memory", len(states), place["state"])
-        nothing = "0.0, " * (1 + len(self.judgement))
-        lines = []
-        if self.flow.pruned:
-            lines += [
-                f"count = int(memory[{place['count']}])",
-                f"if count == {HISTORY}:",
-                f"    return ({HISTORY_FULL}, {nothing})",
-            ]
-        for i, (action, control) in enumerate(zip(self.actions, controls, strict=True)):
-            lines += [
-                f"if {action} != {action}:",
-                f"    return ({BAD_ACTION}, {nothing})",
-                f"{action} = min(max({action}, -1.0), 1.0)",
-                f"{control} = memory[{place['limit'] + i}]*{action}",
-            ]
-        if self.flow.pruned:
-            m = len(self.actions)
-            lines += [
-                *(f"memory[{place['history'] + i} + {m}*count] = {a}" for i, a in enumerate(self.actions)),
-                f"memory[{place['count']}] = count + 1.0",
-            ]
-        held = f"{', '.join(controls)}, {'1.0, ' * len(self.joints)}"
-        lines += [
-            f"{old}= {state},",
-            f"dt = memory[{place['dt']}]",
-            f"k = memory[{self.memory['k'][0]}:{self.memory['k'][1]}]",
-        ]
-        flight = f"{new}= advance_states(dt, {old}{held}k)"
-        lines += self._through_impacts(old, new, controls, flight) if self.joints else [flight]
-        lines += [
-            f"status = {RUNNING}",
-            f"if not isfinite({' + '.join(f'0.0*{name}__new' for name in states)}):",
-            f"    {new}= {old}",
-            f"    status = {DIVERGED}",
-            f"{state}, = {new}",
-        ]
-        aim = "".join(f"memory[{place['target'] + i}], " for i in range(len(self.targets)))
-        if self.observation:
-            seen = _items("observation", len(self.observation))
-            lines.append(f"{seen}, = observe({new}{aim}k)")
-        over = ""
-        if self.ending:
-            over = "over, "
-            lines += [
-                "over = 0.0",
-                f"if status == {RUNNING} and ends({new}{aim}k)[0] > 0.0:",
-                "    over = 1.0",
-                f"    status = {TERMINATED}",
-            ]
-        reward = "0.0"
-        if self.judgement:
-            lines.append(f"judged = judge({new}{old}{', '.join(a.name for a in self.actions)}, {aim}{over}k)")
-            rewards = [i for i, name in enumerate(self.judgement) if name.startswith("reward:")]
-            reward = " + ".join(f"judged[{i}]" for i in rewards)
-        lines.append(f"return (status, {reward}, {''.join(f'judged[{i}], ' for i in range(len(self.judgement)))})")
-        # The one entry point is compiled for these types when the module is loaded, and cached.
-        types = f"(float64[::1], float32[::1]{', float64' * len(self.actions)})"
-        decorator = self.backend.decorator.replace("@njit(", f'@njit("{types}", cache=CACHE__, ')
-        arguments = ", ".join(("memory", "observation", *(a.name for a in self.actions)))
-        return f"{decorator}def step({arguments}):\n" + textwrap.indent("\n".join(lines), "    ") + "\n"
-
-    def _through_impacts(self, old: str, new: str, controls: list[str], flight: str) -> list[str]:
-        """Accept free flight if no joint can have met its stop, else integrate from impact to impact."""
-        place = self._places()
-        away, safe = [], []
-        for j, (angle, rate) in enumerate(self.joints):
-            stop = f"memory[{place['stop'] + j}]"
-            excursion = f"fabs({angle}__old) + dt*fabs(joint_rates({old}k)[{j}]) < {stop}"
-            away.append(f"fabs({angle}__old) < {stop}")
-            safe += [f"fabs({angle}__new) < {stop}", f"({rate}__old*{rate}__new >= 0.0 or {excursion})"]
-        parts = ("state", "control", "k", "stop", "free", "work", "hits", "new")
-        arrays = ", ".join(f"memory[{start}:{end}]" for start, end in (self.memory[part] for part in parts))
-        n = len(self.flow.states)
-        return [
-            f"if {' and '.join(away)}:",
-            f"    {flight}",
-            f"    accepted = {' and '.join(safe)}",
-            "else:",
-            f"    {new}= {old}",
-            "    accepted = False",
-            "if not accepted:",
-            f"    {_items('memory', len(controls), place['control'])}, = {', '.join(controls)},",
-            f"    {_items('memory', n, place['new'])}, = {new}",
-            f"    hold(dt, {arrays})",
-            f"    {new}= {_items('memory', n, place['state'])},",
-        ]
-
-
-def _integrated(flow: Dataflow) -> dict[str, sp.Expr]:
-    """What the step function of `codegen` reads."""
-    rates = {f"rate:{s.name}": rate for s, rate in flow.rates.items() if s not in flow.solutions}
-    return {**rates, **{f"solution:{s.name}": solution for s, solution in flow.solutions.items()}}
+    def advance(self, new: str, state: str, control: str, free: str) -> str:
+        """Lines that advance a state by `h`, through all substeps."""
+        return f"{new}, = advance_states(h, {state}, {control}, {free}, k)"
 
 
 def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) -> dict[str, sp.Expr]:
@@ -400,9 +320,16 @@ def _joint(equations: ReducedEquations, joint: str) -> tuple[sp.Symbol, sp.Symbo
     return equations.coordinates[index], moving[0]
 
 
-def _items(array: str, count: int, start: int = 0) -> str:
+def included(sources: Iterable[Callable[..., Any]], backend: Backend) -> list[str]:
+    """Source of functions that a generated module takes in whole."""
+    return [backend.decorator + inspect.getsource(function).replace(": Array", "") for function in sources]
+
+
+def items(array: str, count: int, start: int = 0) -> str:
+    """Source of `count` elements of an array, separated by commas."""
     return ", ".join(f"{array}[{start + i}]" for i in range(count))
 
 
-def _label(name: str) -> str:
+def label(name: str) -> str:
+    """Name of an output without the word for its kind."""
     return name.partition(":")[2]

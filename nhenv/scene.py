@@ -28,11 +28,21 @@ from mechanics.expressions import unknown_name
 from mechanics.mechanism import Mechanism
 from nhenv.tasks import Task
 
-__all__ = ["BACKENDS", "BAD_ACTION", "DIVERGED", "HISTORY_FULL", "RUNNING", "TERMINATED", "Scene"]
+__all__ = ["BACKENDS", "BAD_ACTION", "DIVERGED", "HISTORY_FULL", "LARGEST", "RUNNING", "TERMINATED", "Scene"]
 
 RUNNING, BAD_ACTION, DIVERGED, HISTORY_FULL, TERMINATED = 0.0, 1.0, 2.0, 3.0, 4.0
 
+# A state beyond this, in SI units, has diverged; sines of angles below it are still exact.
+LARGEST = 2.0**40
+
 BACKENDS = ("numba", "numpy")  # those of `mechanics.compiler.codegen`, which loads SymPy
+
+
+# Source files of this package that a kernel follows from.
+_DERIVING = (
+    *("scene", "generate", "one_kernel", "entry", "response"),
+    *("rows_kernel", "rows", "random_streams", "observation"),
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,7 @@ class Scene:
         integrator: name of a method, or "auto".
         substeps: steps of the method in a hold; None for the default.
         backend: "numba" or "numpy".
+        whole_state: whether states are followed that nothing observed, rewarded or reported depends on.
     """
 
     mechanism: Mechanism
@@ -56,6 +67,7 @@ class Scene:
     integrator: str = "auto"
     substeps: int | None = None
     backend: str = "numba"
+    whole_state: bool = False
 
     def __post_init__(self) -> None:
         if self.integrator not in ("auto", *method_names()):
@@ -70,10 +82,21 @@ class Scene:
         weights = self.task.weights if self.task else ()
         return (*self.mechanism.parameters, *weights, "dt", "forward")
 
-    @cached_property
+    @property
     def targets(self) -> tuple[str, ...]:
         """Names of the task's targets that the kernel uses, in the order of their places."""
-        return getattr(self.kernel, "TARGETS", ())
+        return self.kernel.TARGETS
+
+    @cached_property
+    def noisy(self) -> tuple[str, ...]:
+        """Coordinates that are random at reset: the joints with stops, or else the heading."""
+        return tuple(self.mechanism.joint_limits) or self.mechanism.fibre[2:]
+
+    @cached_property
+    def draws(self) -> int:
+        """Uniform numbers that the beginning of an episode takes: for coordinates, then for targets."""
+        rules = self.task.targets.values() if self.task else ()
+        return len(self.noisy) + sum(not isinstance(rule, str) for rule in rules)
 
     @cached_property
     def joints(self) -> tuple[str, ...]:
@@ -82,13 +105,27 @@ class Scene:
 
     @cached_property
     def kernel(self) -> ModuleType:
-        """The compiled module, from the cache if possible."""
+        """The compiled module for one environment, from the cache if possible."""
+        return self._load("one")
+
+    @cached_property
+    def rows_kernel(self) -> ModuleType:
+        """The compiled module for many environments side by side that have the same parameters."""
+        return self._load("rows")
+
+    @cached_property
+    def varied_kernel(self) -> ModuleType:
+        """The compiled module for many environments side by side, each with parameters of its own."""
+        return self._load("varied")
+
+    def _load(self, kind: str) -> ModuleType:
         specification = self.__getstate__()
         specification["mechanism"] = self.mechanism.to_dict()
         specification["task"] = dataclasses.asdict(self.task) if self.task else None
-        name = f"{self.mechanism.name}_{self.task.name if self.task else 'state'}_{self.backend}"
-        deriving = tuple(Path(__file__).with_name(f"{part}.py") for part in ("scene", "generate", "observation"))
-        return kernels.load(name, specification, self.source, deriving=deriving)
+        specification["kind"] = kind
+        name = f"{self.mechanism.name}_{self.task.name if self.task else 'state'}_{kind}_{self.backend}"
+        deriving = tuple(Path(__file__).with_name(f"{part}.py") for part in _DERIVING)
+        return kernels.load(name, specification, lambda: self.source(kind), deriving=deriving)
 
     @cached_property
     def whole(self) -> Scene:
@@ -135,8 +172,12 @@ class Scene:
         """Everything but the kernel, which is loaded again."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
-    def source(self) -> str:
-        """Derive the source of the kernel; `kernel` calls this when the cache has none."""
-        from nhenv.generate import kernel_source
+    def source(self, kind: str = "one") -> str:
+        """Derive the source of a kernel, "one", "rows" or "varied"; called when the cache has none."""
+        if kind == "one":
+            from nhenv.one_kernel import OneKernel
 
-        return kernel_source(self)
+            return OneKernel(self).module()
+        from nhenv.rows_kernel import RowsKernel
+
+        return RowsKernel(self, varied=kind == "varied").module()

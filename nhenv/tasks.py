@@ -27,9 +27,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import numpy as np
-
-from mechanics.expressions import ExpressionError, check_name, evaluate, names_in, unknown_name
+from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name
 from mechanics.mechanism import Mechanism
 
 __all__ = ["POSE", "TASKS", "Task", "get"]
@@ -95,17 +93,6 @@ class Task:
                 raise ValueError(f"a task's data lack {key!r}; they have {', '.join(map(str, data))}")
         rules = {name: tuple(r) if isinstance(r, list) else r for name, r in data.get("targets", {}).items()}
         return cls(**{**data, "targets": rules})
-
-    def draw(self, rng: np.random.Generator, given: Mapping[str, float]) -> dict[str, float]:
-        """Targets of an episode by name; those `given` replace what is drawn, and others may follow from them.
-
-        What is given does not change what is drawn.
-        """
-        values: dict[str, float] = {}
-        for name, rule in self.targets.items():
-            value = evaluate(rule, values) if isinstance(rule, str) else rng.uniform(*rule)
-            values[name] = float(given.get(name, value))
-        return values
 
     def missing(self, mechanism: Mechanism) -> tuple[str, ...]:
         """Names that this task uses and `mechanism` does not have: none if the task fits."""

@@ -10,13 +10,14 @@ ROOT = Path(__file__).parents[1]
 
 HEAVY = ("sympy", "torch", "stable_baselines3", "pygame", "matplotlib")
 
-# nhenv.generate derives kernels, and is itself imported only when the cache has none.
+# What derives kernels is itself imported only when the cache has none, and the adapter only by its users.
+APART = ("nhenv.generate", "nhenv.one_kernel", "nhenv.rows_kernel", "nhenv.sb3")
 LOAD_EVERY_MODULE = f"""
 import importlib, pkgutil, sys
 import mechanics, nhenv
 
 for module in pkgutil.walk_packages(nhenv.__path__, "nhenv."):
-    if module.name not in ("nhenv.generate",):
+    if module.name not in {APART}:
         importlib.import_module(module.name)
 print(*(name for name in {HEAVY} if name in sys.modules))
 """

@@ -9,75 +9,21 @@ lets users have neither.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from operator import methodcaller
 
 import sympy as sp
-from sympy.printing.pycode import PythonCodePrinter
 
+from mechanics.compiler.backends import BACKENDS, Backend
 from mechanics.compiler.dataflow import TAU, Dataflow, initial
 from mechanics.compiler.integrators import Method
 
-__all__ = ["BACKENDS", "Backend", "Program", "needed", "operation_count"]
+__all__ = ["Program", "integrated", "needed", "operation_count"]
 
-
-@dataclass(frozen=True)
-class Backend:
-    """What differs between targets: the imports and the decorator of a function."""
-
-    name: str
-    header: str
-    decorator: str
-
-
-BACKENDS = {
-    # Scalars or arrays of any shape, no compiler.
-    "numpy": Backend(
-        "numpy",
-        "from numpy import abs as fabs\nfrom numpy import arccos as acos\nfrom numpy import arcsin as asin\n"
-        "from numpy import arctan as atan\nfrom numpy import arctan2 as atan2\n"
-        "from numpy import copysign, cos, cosh, exp, inf, isfinite, log, pi, sign, sin, sinh, sqrt, tan, tanh\n",
-        "",
-    ),
-    # Scalars, inlined into the kernel that calls them. fastmath without nnan and ninf: finiteness
-    # is tested in the same code, and must not be assumed.
-    "numba": Backend(
-        "numba",
-        "from math import acos, asin, atan, atan2, copysign, cos, cosh, exp, fabs, inf, isfinite, log, pi\n"
-        "from math import sin, sinh, sqrt, tan, tanh\n\n"
-        "from numba import njit\nfrom numpy import sign\n",
-        '@njit(error_model="numpy", fastmath={"contract", "nsz", "arcp"})\n',
-    ),
-}
 
 # d sin = cos * rate, d cos = -sin * rate
 _QUARTER_TURN: dict[type, tuple[type, str]] = {sp.sin: (sp.cos, ""), sp.cos: (sp.sin, "-")}
-
-
-class _Printer(PythonCodePrinter):
-    """Python source of a lowered expression; powers as products, rationals as decimals."""
-
-    def __init__(self) -> None:
-        super().__init__({"fully_qualified_modules": False, "precision": 17})
-
-    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
-        if expr.exp.is_Integer and 2 <= expr.exp <= 4:
-            base = self.parenthesize(expr.base, 60)
-            return f"({'*'.join([base] * int(expr.exp))})"
-        return super()._print_Pow(expr, rational=rational)
-
-    def _print_Rational(self, expr: sp.Rational) -> str:
-        return repr(float(expr))
-
-    def _print_Exp1(self, expr: sp.Expr) -> str:
-        return repr(float(expr))
-
-    def _print_Function(self, expr: sp.Function) -> str:
-        name = {"Abs": "abs"}.get(expr.func.__name__, expr.func.__name__)
-        return f"{name}({', '.join(self._print(argument) for argument in expr.args)})"
-
-    _print_Abs = _print_sign = _print_Function
 
 
 class Program:
@@ -193,16 +139,16 @@ class Program:
     def constants_function(self, name: str, parameters: Sequence[sp.Symbol]) -> str:
         """Source of `name(p)`: parameter values in the given order -> tuple of constants."""
         lines = [f"{p.name} = _p[{i}]" for i, p in enumerate(parameters)]
-        printer = _Printer()
-        values = "".join(f"{printer.doprint(expression)},\n" for expression in self.constants.values())
+        write = BACKENDS["numpy"].write
+        values = "".join(f"{write(expression)},\n" for expression in self.constants.values())
         return _function(name, ["_p"], [*lines, f"return (\n{_indent(values)})"], "")
 
     def function(self, name: str, arguments: Sequence[sp.Symbol], outputs: Sequence[str], backend: Backend) -> str:
         """Source of `name(*arguments, k)` that returns a tuple of the named outputs."""
-        body = _Body(self)
+        body = _Body(self, backend)
         point = _Point("", {symbol: symbol.name for symbol in arguments})
         values = [body.value(self.outputs[output], point) for output in outputs]
-        lines = [*self._unpack(body), *body.lines, f"return ({''.join(f'{value}, ' for value in values)})"]
+        lines = [*self._unpack(body), *body.text(), f"return ({''.join(f'{value}, ' for value in values)})"]
         return _function(name, [*(a.name for a in arguments), "_k"], lines, backend.decorator)
 
     def step_function(
@@ -213,11 +159,17 @@ class Program:
         substeps: int,
         held: Sequence[sp.Symbol],
         backend: Backend,
+        carried: Mapping[str, sp.Expr] | None = None,
+        streams: int = 1,
     ) -> str:
-        """Source of `name(_h, *states, *held, _k)` -> states after _h seconds.
+        """Source of `name(_h, *states, *carried, *held, _k)` -> states after _h seconds.
+
+        With several streams, of one that takes these arguments for one system after the other, and does every
+        operation for one after the other: what one waits for, another uses the time of.
 
         Outputs of this program must include "rate:STATE" for each state of `flow` that is not
-        exact and "solution:STATE" for each that is.
+        exact and "solution:STATE:POWER" for each coefficient of each that is: see `integrated`.
+        What is `carried`, see there, is taken as given at the beginning of the step.
         """
         if flow.core and not method.explicit:
             core = ", ".join(symbol.name for symbol in flow.core)
@@ -225,9 +177,11 @@ class Program:
                 f"integrator {method.name!r} would be implicit on ({core}), which need one another; "
                 "choose an explicit one such as 'dop853' or 'rk4', or 'auto'"
             )
-        body = _Body(self)
+        body = _Body(self, backend)
         base = {symbol: symbol.name for symbol in (*flow.states, *held)}
         base |= {initial(state): state.name for state in flow.states}
+        carried = carried or {}
+        base |= {expression: given for given, expression in carried.items()}
         start, end = _Point("", {**base, TAU: "_h"}), {}
         stages = [_Stage(self, body, flow, method, i, start) for i in range(method.stages)]
         for stage in stages:
@@ -239,19 +193,81 @@ class Program:
                         stage.rate(state)
             for state in layer.states:
                 if layer.kind == "exact":
-                    end[state] = body.value(self.outputs[f"solution:{state.name}"], start)
+                    end[state] = body.polynomial(state, "_h", start)
                 else:
-                    slope = _weighted(method.b, stages, methodcaller("rate", state))
-                    end[state] = f"{state.name} + _h*({slope})"
+                    end[state] = body.moved(state.name, method.b, stages, methodcaller("rate", state))
         names = [state.name for state in flow.states]
-        values = _indent("".join(f"{end[state]},\n" for state in flow.states))
-        lines = [*body.lines, f"{', '.join(names)}, = (\n{values})"] if names else []
+        arguments = ["_h", *names, *carried, *(symbol.name for symbol in held)]
+        lines, values = body.text(), [end[state] for state in flow.states]
+        if streams > 1:
+            local = _renamer([*arguments, *(line.partition(" = ")[0] for line in lines)])
+            lines = [local(line, i) for line in lines for i in range(streams)]
+            values = [local(value, i) for i in range(streams) for value in values]
+            names, arguments = (
+                [local(name, i) for i in range(streams) for name in group] for group in (names, arguments)
+            )
+        text = _indent("".join(f"{value},\n" for value in values))
+        lines = [*lines, f"{', '.join(names)}, = (\n{text})"] if names else []
         if substeps > 1:
             loop = _indent("\n".join(lines))
             lines = [f"_h = _h*{1 / substeps!r}", f"for _ in range({substeps}):\n{loop}"]
         lines = [*self._unpack(body), *lines, f"return ({''.join(f'{n}, ' for n in names)})"]
-        arguments = ["_h", *names, *(symbol.name for symbol in held), "_k"]
-        return _function(name, arguments, lines, backend.decorator)
+        return _function(name, [*arguments, "_k"], lines, backend.decorator)
+
+    def carried(self, flow: Dataflow, method: Method) -> dict[str, sp.Expr]:
+        """What a step needs of the state that it begins with and no control takes part in: name -> expression.
+
+        It follows from the state at the end of the step before, where the observation needs most of it too. Nothing
+        for a method whose first stage is not the beginning of the step.
+        """
+        if not any(_is_start(method, i) for i in range(method.stages)):
+            return {}
+        turned: dict[str, sp.Expr] = {}
+        found: dict[str, sp.Expr] = {}
+        wanted = [self.outputs[f"rate:{state.name}"] for state in flow.rates if state not in flow.solutions]
+        seen: set[sp.Symbol] = set()
+        while wanted:
+            for symbol in sorted(wanted.pop().free_symbols & self.temporaries.keys() - seen, key=lambda s: s.name):
+                seen.add(symbol)
+                expression = self.temporaries[symbol]
+                if _turns(expression, flow, method):
+                    angle = expression.args[0]
+                    turned |= {f"_{f.__name__}_{angle.name}": f(angle) for f in (sp.sin, sp.cos)}
+                elif self._rests_on_states(symbol, flow) and not self._with_turning(symbol, flow, method):
+                    found[f"_at{symbol.name}"] = symbol
+                else:
+                    wanted.append(expression)
+        # What is a product of others that are carried anyway is not worth its place.
+        symbols = set(found.values())
+        for name, symbol in list(found.items()):
+            inner = self.temporaries[symbol].free_symbols & self.temporaries.keys()
+            if inner and inner <= symbols - {symbol}:
+                del found[name]
+        return {**turned, **found}
+
+    def carry_function(self, name: str, flow: Dataflow, carried: Mapping[str, sp.Expr], backend: Backend) -> str:
+        """Source of `name(*states, _k)` -> what is `carried`."""
+        body = _Body(self, backend)
+        point = _Point("", {state: state.name for state in flow.states})
+        values = [body.value(expression, point) for expression in carried.values()]
+        lines = [*self._unpack(body), *body.text(), f"return ({''.join(f'{value}, ' for value in values)})"]
+        return _function(name, [*(state.name for state in flow.states), "_k"], lines, backend.decorator)
+
+    def _rests_on_states(self, symbol: sp.Symbol, flow: Dataflow) -> bool:
+        """Whether states and constants are all that a temporary follows from."""
+        for inner in self.temporaries[symbol].free_symbols:
+            if inner in self.temporaries:
+                if not self._rests_on_states(inner, flow):
+                    return False
+            elif inner not in flow.rates and inner not in self.constants:
+                return False
+        return True
+
+    def _with_turning(self, symbol: sp.Symbol, flow: Dataflow, method: Method) -> bool:
+        """Whether sines that are integrated take part in a temporary, which then costs little at the start."""
+        expression = self.temporaries[symbol]
+        inner = expression.free_symbols & self.temporaries.keys()
+        return _turns(expression, flow, method) or any(self._with_turning(s, flow, method) for s in inner)
 
     def _unpack(self, body: _Body) -> list[str]:
         return [f"{symbol.name} = _k[{i}]" for i, symbol in enumerate(self.constants) if symbol in body.constants]
@@ -274,7 +290,7 @@ class _Stage(_Point):
     def __init__(
         self, program: Program, body: _Body, flow: Dataflow, method: Method, index: int, start: _Point
     ) -> None:
-        at_start = method.c[index] == 0 and not any(method.a[index])
+        at_start = _is_start(method, index)
         super().__init__("" if at_start else f"__{index + 1}", start.names if at_start else {})
         self._program, self._body, self._flow, self._start = program, body, flow, start
         self._method, self._index, self._at_start = method, index, at_start
@@ -288,24 +304,21 @@ class _Stage(_Point):
         if symbol == TAU:
             self.names[symbol] = self._body.assign(f"_h{self.suffix}", f"_h*{self._method.c[self._index]!r}")
         elif symbol in self._flow.solutions:
-            value = self._body.value(self._program.outputs[f"solution:{symbol.name}"], self)
+            time = self.resolve(TAU)
+            assert time is not None
+            value = self._body.polynomial(symbol, time, self._start)
             self.names[symbol] = self._body.assign(f"{symbol.name}{self.suffix}", value)
         elif symbol in self._flow.rates:
             row = self._method.a[self._index]
-            value = f"{symbol.name} + _h*({_weighted(row, self.others, methodcaller('rate', symbol))})"
+            value = self._body.moved(symbol.name, row, self.others, methodcaller("rate", symbol))
             self.names[symbol] = self._body.assign(f"{symbol.name}{self.suffix}", value)
         else:
             return self._start.resolve(symbol)
         return self.names[symbol]
 
     def carries(self, expression: sp.Expr) -> bool:
-        """Whether this is the sine or cosine of an integrated angle under an explicit method."""
-        return (
-            expression.func in _QUARTER_TURN
-            and expression.args[0] in self._flow.rates
-            and expression.args[0] not in self._flow.solutions
-            and self._method.explicit
-        )
+        """Whether this is a sine or cosine that is integrated along with its angle."""
+        return _turns(expression, self._flow, self._method)
 
     def circle(self, function: type[sp.sin] | type[sp.cos], angle: sp.Symbol) -> str:
         """Sine or cosine of an angle, integrated along with it from the beginning of the step.
@@ -320,8 +333,8 @@ class _Stage(_Point):
                 value = f"{function.__name__}({angle.name})"
             else:
                 row = self._method.a[self._index]
-                slope = _weighted(row, self.others, methodcaller("circle_rate", function, angle))
-                value = f"{self.others[0].circle(function, angle)} + _h*({slope})"
+                first = self.others[0].circle(function, angle)
+                value = self._body.moved(first, row, self.others, methodcaller("circle_rate", function, angle))
             self.names[key] = self._body.assign(name, value)
         return self.names[key]
 
@@ -335,29 +348,63 @@ class _Stage(_Point):
         return self._circle_rates[key]
 
     def rate(self, state: sp.Symbol) -> str:
+        """Rate of a state times the length of the step."""
         if state not in self._rates:
             value = self._body.value(self._program.outputs[f"rate:{state.name}"], self)
-            self._rates[state] = self._body.assign(f"_r_{state.name}__{self._index + 1}", value)
+            self._rates[state] = self._body.assign(f"_r_{state.name}__{self._index + 1}", f"_h*({value})")
         return self._rates[state]
 
 
 class _Body:
     """Lines of a function under construction."""
 
-    def __init__(self, program: Program) -> None:
-        self.lines: list[str] = []
+    def __init__(self, program: Program, backend: Backend) -> None:
         self.constants: set[sp.Symbol] = set()
-        self._program = program
-        self._printer = _Printer()
+        self._lines: list[tuple[str, str]] = []  # name, value
+        self._program, self._backend = program, backend
         self._moving: dict[sp.Symbol, bool] = {}
 
     def assign(self, name: str, value: str) -> str:
-        self.lines.append(f"{name} = {value}")
+        self._lines.append((name, value))
         return name
+
+    def text(self) -> list[str]:
+        """The lines."""
+        return [f"{name} = {value}" for name, value in self._lines]
 
     def value(self, expression: sp.Expr, point: _Point) -> str:
         """Source of `expression` at `point`, what it needs emitted before."""
-        return self._printer.doprint(expression.xreplace(self._names(expression, point)))
+        return self._backend.write(expression.xreplace(self._names(expression, point)))
+
+    def moved(
+        self, base: str, weights: Sequence[float], stages: Sequence[_Stage], rate: Callable[[_Stage], str]
+    ) -> str:
+        """Source of base + weighted sum of rates; those of weight zero are not even computed.
+
+        The newest rate comes last, so that nothing but one addition waits for it.
+        """
+        products = [(repr(w), rate(stage)) for w, stage in zip(weights, stages, strict=True) if w]
+        return self._backend.sum_of_products(products, base)
+
+    def polynomial(self, state: sp.Symbol, time: str, start: _Point) -> str:
+        """Source of an exact state after `time`, by Horner's rule; its coefficients hold for the whole step."""
+        value, power = "", 1
+        while f"solution:{state.name}:{power}" in self._program.outputs:
+            power += 1
+        for i in range(power - 1, 0, -1):
+            coefficient = self._program.outputs[f"solution:{state.name}:{i}"]
+            if coefficient == 0 and not value:
+                continue
+            key = sp.Symbol(f"solution:{state.name}:{i}")
+            if key not in start.names:
+                start.names[key] = self.assign(f"_p{i}_{state.name}", self.value(coefficient, start))
+            value = self._horner(time, value, start.names[key])
+        return self._horner(time, value, state.name)
+
+    def _horner(self, time: str, value: str, coefficient: str) -> str:
+        if not value:
+            return coefficient
+        return self._backend.sum_of_products([(time, value if self._backend.fused else f"({value})")], coefficient)
 
     def _names(self, expression: sp.Expr, point: _Point) -> dict[sp.Symbol, sp.Symbol]:
         names = {}
@@ -398,6 +445,35 @@ class _Body:
         return self._moving[symbol]
 
 
+def _is_start(method: Method, stage: int) -> bool:
+    """Whether a stage of a method is the beginning of the step."""
+    return method.c[stage] == 0 and not any(method.a[stage])
+
+
+def _turns(expression: sp.Expr, flow: Dataflow, method: Method) -> bool:
+    """Whether this is the sine or cosine of an integrated angle, under an explicit method."""
+    return (
+        expression.func in _QUARTER_TURN
+        and expression.args[0] in flow.rates
+        and expression.args[0] not in flow.solutions
+        and method.explicit
+    )
+
+
+def integrated(flow: Dataflow) -> dict[str, sp.Expr]:
+    """The outputs that a program's `step_function` reads.
+
+    "rate:STATE" for each state that is not exact; for each that is, "solution:STATE:POWER" for every power of the time
+    since the beginning of the step but the zeroth, whose coefficient is the state there.
+    """
+    outputs = {f"rate:{s.name}": rate for s, rate in flow.rates.items() if s not in flow.solutions}
+    for state, solution in flow.solutions.items():
+        for i, coefficient in enumerate(sp.Poly(solution, TAU).all_coeffs()[::-1]):
+            if i:
+                outputs[f"solution:{state.name}:{i}"] = coefficient
+    return outputs
+
+
 def needed(
     expressions: Iterable[sp.Expr], definitions: Sequence[tuple[sp.Symbol, sp.Expr]]
 ) -> dict[sp.Symbol, sp.Expr]:
@@ -416,9 +492,10 @@ def operation_count(program: Program) -> int:
     return int(sum(sp.count_ops(expression) for expression in program._everything()))
 
 
-def _weighted(weights: Sequence[float], stages: Sequence[_Stage], rate: Callable[[_Stage], str]) -> str:
-    """Weighted sum of rates; those of weight zero are not even computed."""
-    return " + ".join(f"{weight!r}*{rate(stage)}" for weight, stage in zip(weights, stages, strict=True) if weight)
+def _renamer(names: Iterable[str]) -> Callable[[str, int], str]:
+    """Function that gives these names in a text another ending for each stream."""
+    pattern = re.compile(r"\b(?:" + "|".join(map(re.escape, set(names))) + r")\b")
+    return lambda text, stream: pattern.sub(lambda found: f"{found[0]}__stream{stream}", text)
 
 
 def _function(name: str, arguments: Sequence[str], lines: Sequence[str], decorator: str) -> str:

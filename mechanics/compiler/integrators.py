@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 from mechanics.expressions import unknown_name
 
 __all__ = ["Method", "method", "method_names"]
 
-# Coefficients are double precision: conditions on them hold to a few roundings of a sum of 12.
+# Coefficients are double precision: conditions on them hold to a few roundings of a sum of 15.
 CONDITION_TOLERANCE = 1e-14
 
 
@@ -51,7 +52,7 @@ class Method:
             self._expect(f"sum b c^{k - 1} = 1/{k}", moment, 1 / k)
 
     def _expect(self, what: str, value: float, expected: float) -> None:
-        # Dormand-Prince 8 has weights up to 43, whose roundings add up.
+        # Dormand-Prince 8 has weights up to 43 and Verner 9 up to 15, whose roundings add up.
         scale = max(1.0, *(abs(x) for row in self.a for x in row))
         if abs(value - expected) > CONDITION_TOLERANCE * scale:
             raise ValueError(f"{self.name} violates '{what}': {value} is not {expected}")
@@ -88,33 +89,98 @@ def _dop853() -> Method:
     )
 
 
-def _gauss(s: int) -> Method:
-    # Nodes are the roots of the shifted Legendre polynomial; a_ij integrates the j-th Lagrange
-    # polynomial up to c_i. Forty digits, because a float64 Vandermonde solve loses ten of sixteen.
+def _verner9() -> Method:
+    # Only what propagates the solution: the pair's sixteenth stage serves the error estimate alone.
+    nodes = (
+        0.0, 0.03462, 0.09702435063878044, 0.14553652595817068, 0.561, 0.229007911590485, 0.544992088409515, 0.645,
+        0.48375, 0.06757, 0.25, 0.6590650618730999, 0.8206, 0.9012, 1.0,
+    )  # fmt: skip
+    # Stage: the stages that it uses, and their weights.
+    rows = {
+        2: ((1,), (0.03462,)),
+        3: ((1, 2), (-0.038933543885728734, 0.13595789452450918)),
+        4: ((1, 3), (0.03638413148954267, 0.109152394468628)),
+        5: ((1, 3, 4), (2.02576391439397, -7.638023836496292, 6.173259922102322)),
+        6: ((1, 4, 5), (0.05112275589406061, 0.17708237945550215, 0.0008027762409222502)),
+        7: ((1, 4, 5, 6), (0.13160063579752163, -0.29572762526696367, 0.08781378035642952, 0.6213052975225275)),
+        8: ((1, 6, 7), (0.07166666666666667, 0.33055335789153195, 0.24277997544180138)),
+        9: ((1, 6, 7, 8), (0.071806640625, 0.3294380283228177, 0.11651900292718229, -0.034013671875)),
+        10: ((1, 6, 7, 8, 9), (0.04836757646340647, 0.03928989925676164, 0.10547409458903446, -0.021438652846483126,
+             -0.10412291746271944)),
+        11: ((1, 6, 7, 8, 9, 10), (-0.026645614872014785, 0.03333333333333333, -0.1631072244872467,
+             0.033960816841277615, 0.1572319413814626, 0.21522674780318796)),
+        12: ((1, 6, 7, 8, 9, 10, 11), (0.036890092487086225, -0.1465181576725543, 0.22425777681720244,
+             0.022944057170660725, -0.003585005290572876, 0.08669223316444385, 0.43838406519683376)),
+        13: ((1, 6, 7, 8, 9, 10, 11, 12), (-0.48660122151133406, -6.304602650282853, -0.2812456182894726,
+             -2.6790192362198493, 0.5188156639241576, 1.3653531876033418, 5.8850910885039465, 2.8028087862720628)),
+        14: ((1, 6, 7, 8, 9, 10, 11, 12, 13), (0.41853674577534716, 6.724547581906459, -0.4254442801646118,
+             3.3432791530012658, 0.6170816631175378, -0.9299661239399328, -6.099948804751011, -3.002206187889399,
+             0.2553202529443446)),
+        15: ((1, 6, 7, 8, 9, 10, 11, 12, 13, 14), (-0.7793740861228846, -13.937342538107776, 1.2520488533793572,
+             -14.69150040801687, -0.4947050585331417, 2.2429749091462368, 13.367893803828643, 14.396650486650687,
+             -0.79758133317768, 0.4409353709534278)),
+    }  # fmt: skip
+    end = ((1, 8, 9, 10, 11, 12, 13, 14, 15), (0.014611976858423152, -0.3915211862331339, 0.23109325002895065,
+           0.12747667699928525, 0.2246434176204158, 0.5684352689748513, 0.058258715572158275, 0.13643174034822156,
+           0.030570139830827976))  # fmt: skip
+
+    def spread(used: tuple[int, ...], weights: tuple[float, ...]) -> tuple[float, ...]:
+        row = dict(zip(used, weights, strict=True))
+        return tuple(row.get(stage, 0.0) for stage in range(1, len(nodes) + 1))
+
+    a = tuple(spread(*rows.get(stage, ((), ()))) for stage in range(1, len(nodes) + 1))
+    source = "Verner, Numerically optimal Runge-Kutta pairs with interpolants, 2010: the most efficient 9(8) pair"
+    return Method("verner9", a, spread(*end), nodes, 9, source)
+
+
+def _collocation(name: str, polynomial: Callable[[Any], Any], degree: int, order: int, source: str) -> Method:
+    # Nodes are the roots of a polynomial on [0, 1]; a_ij integrates the j-th Lagrange polynomial up to
+    # c_i. Forty digits, because a float64 Vandermonde solve loses ten of sixteen.
     import mpmath
 
     with mpmath.workdps(40):
-        legendre = mpmath.taylor(lambda x: mpmath.legendre(s, 2 * x - 1), 0, s)[::-1]
-        c = sorted(mpmath.polyroots(legendre, maxsteps=200, extraprec=200), key=lambda root: root.real)
-        c = [mpmath.re(root) for root in c]
-        powers = mpmath.matrix(s, s)
-        for k in range(s):
-            for j in range(s):
+        coefficients = mpmath.taylor(polynomial, 0, degree)[::-1]
+        roots = mpmath.polyroots(coefficients, maxsteps=200, extraprec=200)
+        c = sorted(mpmath.re(root) for root in roots)
+        powers = mpmath.matrix(degree, degree)
+        for k in range(degree):
+            for j in range(degree):
                 powers[k, j] = c[j] ** k
 
         def weights(end: mpmath.mpf) -> tuple[float, ...]:
-            moments = mpmath.matrix([end ** (k + 1) / (k + 1) for k in range(s)])
+            moments = mpmath.matrix([end ** (k + 1) / (k + 1) for k in range(degree)])
             return tuple(float(w) for w in mpmath.lu_solve(powers, moments))
 
         a = tuple(weights(end) for end in c)
         b = weights(mpmath.mpf(1))
-    return Method(f"gauss{s}", a, b, tuple(map(float, c)), 2 * s, "Gauss-Legendre collocation, Kuntzmann and Butcher")
+    return Method(name, a, b, tuple(map(float, c)), order, source)
+
+
+def _gauss(s: int) -> Method:
+    from mpmath import legendre
+
+    source = "Gauss-Legendre collocation, Kuntzmann and Butcher"
+    return _collocation(f"gauss{s}", lambda x: legendre(s, 2 * x - 1), s, 2 * s, source)
+
+
+def _lobatto(s: int) -> Method:
+    # Both ends are nodes. What depends on the state alone is the same at the end of a step, in what is
+    # observed there and at the start of the next: s - 1 evaluations for the order of s - 1 Gauss nodes.
+    from mpmath import legendre
+
+    source = "Lobatto IIIA collocation, Ehle and Butcher"
+    # x (1 - x) P'_{s-1} is, up to a factor, P_s - P_{s-2}.
+    return _collocation(
+        f"lobatto{s}", lambda x: legendre(s, 2 * x - 1) - legendre(s - 2, 2 * x - 1), s, 2 * s - 2, source
+    )
 
 
 _METHODS: dict[str, Callable[[], Method]] = {
     "rk4": _rk4,
     "dop853": _dop853,
+    "verner9": _verner9,
     **{f"gauss{s}": partial(_gauss, s) for s in range(1, 7)},
+    **{f"lobatto{s}": partial(_lobatto, s) for s in range(3, 8)},
 }
 
 

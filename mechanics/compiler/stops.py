@@ -12,7 +12,7 @@ below are stand-ins for what the generated module defines itself.
 from math import copysign, inf, sqrt
 from typing import Any
 
-__all__ = ["CONSTANTS", "SOURCES", "first_hit", "hold", "settle", "zero"]
+__all__ = ["CONSTANTS", "PURE", "SOURCES", "first_hit", "guess", "hold", "refine", "settle", "zero"]
 
 Array = Any  # NumPy array, or Numba's view of one
 
@@ -145,41 +145,58 @@ def zero(
     place, slope = (RATES[j], len(ANGLES) + j) if turning else (ANGLES[j], j)
     low, high = 0.0, end
     below, above = sign * state[place] - level, sign * new[place] - level
-    # Start from the cubic through both ends and their slopes, which a held torque makes nearly exact.
     motion(new, control, k, work)
     rate_above = sign * work[slope]
     motion(state, control, k, work)
-    rate = sign * work[slope]
+    time = guess(below, above, sign * work[slope], rate_above, end)
+    for _ in range(MAX_ITERATIONS):
+        advance(time, state, control, free, k, new)
+        motion(new, control, k, work)
+        better, low, high = refine(time, low, high, sign * new[place] - level, sign * work[slope], end)
+        if better == time:
+            break
+        time = better
+    return time
+
+
+def guess(below: float, above: float, rate: float, rate_above: float, end: float) -> float:
+    """About when a value passes zero that goes from `below` to `above` in the time `end`, at these rates there.
+
+    From the cubic through both ends, which a held torque makes nearly exact.
+    """
     chord = (above - below) / end
     bend = (3.0 * chord - 2.0 * rate - rate_above) / end
     twist = (rate + rate_above - 2.0 * chord) / (end * end)
     # The parabola without the twist has the root below; from there, Newton on the cubic.
     discriminant = rate * rate - 4.0 * bend * below
+    root = rate + sqrt(discriminant if discriminant > 0.0 else 0.0)
     time = 0.5 * end
-    if below < 0.0 and discriminant > 0.0 and rate + sqrt(discriminant) > 0.0:
-        time = min(-2.0 * below / (rate + sqrt(discriminant)), end)
+    if (below < 0.0) & (discriminant > 0.0) & (root > 0.0):
+        time = min(-2.0 * below / root, end)
     for _ in range(3):
         cubic = below + time * (rate + time * (bend + time * twist))
         cubic_rate = rate + time * (2.0 * bend + time * 3.0 * twist)
-        if cubic_rate > 0.0 and 0.0 < time - cubic / cubic_rate < end:
-            time -= cubic / cubic_rate
-    for _ in range(MAX_ITERATIONS):
-        advance(time, state, control, free, k, new)
-        motion(new, control, k, work)
-        value, rate = sign * new[place] - level, sign * work[slope]
-        if value > 0.0:
-            high = time
-        else:
-            low = time
-        step = value / rate if rate > 0.0 else inf
-        if abs(step) <= TIME_TOLERANCE * end:
-            break
-        guess = time - step if low < time - step < high else 0.5 * (low + high)
-        if not low < guess < high:
-            break
-        time = guess
+        better = time - cubic / cubic_rate
+        if (cubic_rate > 0.0) & (better > 0.0) & (better < end):
+            time = better
     return time
 
 
-# In the order in which a module that contains them defines them.
+def refine(time: float, low: float, high: float, value: float, rate: float, end: float) -> tuple[float, float, float]:
+    """Newton's step from `time`, where what passes zero in (low, high) is `value`, at `rate`; and the new bracket.
+
+    By bisection where Newton's step leaves the bracket; no step where there is nothing left to gain.
+    """
+    low, high = (low, time) if value > 0.0 else (time, high)
+    step = value / rate if rate > 0.0 else inf
+    better = time - step
+    if not ((low < better) & (better < high)):
+        better = 0.5 * (low + high)
+    if (abs(step) <= TIME_TOLERANCE * end) | (not ((low < better) & (better < high))):
+        better = time
+    return better, low, high
+
+
+# In the order in which a module that contains them defines them; those that are worth a place inside others first.
+PURE = (guess, refine)
 SOURCES = (zero, first_hit, settle, hold)

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from oracles import multiplier_acceleration
 
 from mechanics import Mechanism, Model
-from mechanics.compiler.codegen import BACKENDS, Program
+from mechanics.compiler.backends import BACKENDS
+from mechanics.compiler.codegen import Program
 from mechanics.expressions import (
     CONSTANTS,
     FUNCTIONS,

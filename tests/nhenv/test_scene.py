@@ -12,7 +12,7 @@ import pytest
 
 import mechanics
 import nhenv
-from mechanics.compiler import codegen
+from mechanics.compiler import backends
 from mechanics.mechanism import Mechanism
 from nhenv import tasks
 from nhenv.env import LocomotionEnv
@@ -166,4 +166,4 @@ def test_backends_agree_through_impacts(name, task):
 
 
 def test_backends_are_those_of_the_generator():
-    assert sorted(BACKENDS) == sorted(codegen.BACKENDS)
+    assert sorted(BACKENDS) == sorted(backends.BACKENDS)

@@ -5,7 +5,8 @@ import pytest
 import sympy as sp
 
 import mechanics
-from mechanics.compiler.codegen import BACKENDS, Program
+from mechanics.compiler.backends import BACKENDS
+from mechanics.compiler.codegen import Program, integrated
 from mechanics.compiler.dataflow import analyse
 from mechanics.compiler.integrators import method
 from mechanics.geometry.reduction import reduce
@@ -33,9 +34,7 @@ def stepper(execute):
     def make(rates, outputs, name, *, substeps=1, held=(), parameters=None, backend="numpy"):
         flow = analyse(rates, outputs)
         parameters = parameters or {}
-        wanted = {f"rate:{s.name}": rate for s, rate in flow.rates.items() if s not in flow.solutions}
-        wanted |= {f"solution:{s.name}": solution for s, solution in flow.solutions.items()}
-        program = Program(wanted, parameters)
+        program = Program(integrated(flow), parameters)
         source = program.step_function("step", flow, method(name), substeps, held, BACKENDS[backend])
         source += "\n\n" + program.constants_function("constants", list(parameters))
         functions = execute(source, backend)

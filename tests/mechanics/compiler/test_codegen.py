@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from mechanics.compiler.codegen import BACKENDS, Program, operation_count
+from mechanics.compiler.backends import BACKENDS
+from mechanics.compiler.codegen import Program, integrated, operation_count
 from mechanics.compiler.dataflow import analyse
 from mechanics.compiler.integrators import method
 from mechanics.expressions import ExpressionError, check_name
@@ -268,3 +269,61 @@ def test_a_stage_costs_two_angles_at_most(equations, whole_step):
     stages = method({"snakeboard": "gauss4", "roller_racer": "dop853"}[equations.mechanism.name]).stages
     assert max(calls.count("sin"), calls.count("cos")) <= 2 * stages
     assert calls.count("sqrt") == (stages if equations.mechanism.name == "snakeboard" else 0)
+
+
+# -- sums with one rounding, several streams, what is carried --------------------------------------
+
+
+def test_sums_of_products_are_fused_and_right(execute):
+    """The compiler is left nothing to contract, so that vectors and scalars round alike."""
+    a, b, c, d = sp.symbols("a b c d")
+    texts = {"e": a * b + c, "f": -a * d - c * d, "g": a**2 - 3 * b * c + d, "h": (a + b) * (c - d**3)}
+    arguments = (a, b, c, d)
+    source = Program(texts, []).function("f", arguments, list(texts), BACKENDS["numba"])
+    assert source.count("fma(") == 5
+    assert not re.search(r"\w\*\w+ [+-] |[+-] \w+\*", source.partition("return")[2])
+    values = (1.25, -0.7, 3.1, 0.3)
+    ours = execute(source, "numba")["f"](*values, np.zeros(0))
+    exact = [float(text.subs(dict(zip(arguments, values, strict=True)))) for text in texts.values()]
+    assert ours == pytest.approx(exact, rel=4e-16, abs=4e-16)
+
+
+@pytest.mark.parametrize("name", ["rk4", "verner9"])
+def test_two_streams_are_twice_one(equations, name, execute):
+    """To the last bit, and the same is true of what is carried from the step before."""
+    rates = dict(zip(equations.coordinates, equations.velocity, strict=True))
+    rates |= dict(zip(equations.pseudo_velocities, equations.acceleration, strict=True))
+    flow = analyse(rates, list(rates))
+    parameters = [sp.Symbol(p) for p in equations.mechanism.parameters]
+    program = Program(integrated(flow), parameters)
+    held, backend, tableau = equations.controls, BACKENDS["numba"], method(name)
+    carried = program.carried(flow, tableau)
+    assert carried
+    source = "\n\n".join(
+        [
+            program.step_function("once", flow, tableau, 1, held, backend),
+            program.step_function("carrying", flow, tableau, 1, held, backend, carried),
+            program.step_function("twice", flow, tableau, 1, held, backend, carried, streams=2),
+            program.carry_function("carry", flow, carried, backend),
+            program.constants_function("constants", parameters),
+        ]
+    )
+    functions = execute(source, backend.name)
+    k = np.array(functions["constants"](list(equations.mechanism.parameters.values())), dtype=float)
+    rng = np.random.default_rng(8)
+    states = rng.uniform(-1, 1, (2, len(flow.states))).tolist()
+    controls = rng.uniform(-1, 1, (2, len(held))).tolist()
+    one, other = (functions["once"](0.05, *s, *u, k) for s, u in zip(states, controls, strict=True))
+    assert one != other
+    kept = [functions["carry"](*s, k) for s in states]
+    assert functions["carrying"](0.05, *states[0], *kept[0], *controls[0], k) == one
+    both = functions["twice"](0.05, *states[0], *kept[0], *controls[0], 0.05, *states[1], *kept[1], *controls[1], k)
+    assert both == (*one, *other)
+
+
+def test_nothing_is_carried_where_a_step_does_not_begin_with_a_stage(equations):
+    rates = dict(zip(equations.pseudo_velocities, equations.acceleration, strict=True))
+    rates |= dict(zip(equations.coordinates, equations.velocity, strict=True))
+    flow = analyse(rates, list(rates))
+    program = Program(integrated(flow), [sp.Symbol(p) for p in equations.mechanism.parameters])
+    assert program.carried(flow, method("gauss4")) == {}

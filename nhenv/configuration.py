@@ -1,0 +1,217 @@
+"""What environments are made from: their arguments, checked and completed, and what `reset` may be given."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mechanics.expressions import evaluate, unknown_name
+from mechanics.model import Model
+from nhenv import tasks
+from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
+from nhenv.scene import Scene
+
+__all__ = ["Configuration"]
+
+Array = NDArray[np.float64]
+
+
+class Configuration:
+    """A scene and the numbers in it: see `LocomotionEnv` for the arguments.
+
+    Attributes:
+        mechanism: what moves.
+        task: what for.
+        params: name -> value.
+        dt: control period in s.
+        torque_limits: (m,) largest torques.
+        joint_limits: name -> angle.
+        reset_noise_scale: half-width of the initial angles.
+        scene: what is compiled.
+        weights: name -> value.
+    """
+
+    def __init__(
+        self,
+        mechanism: MechanismLike,
+        task: TaskLike = "Forward",
+        *,
+        params: Mapping[str, float] | None = None,
+        dt: float = 0.05,
+        torque_limits: Mapping[str, float] | ArrayLike | None = None,
+        joint_limits: bool | Mapping[str, float] = True,
+        frame: str | None = None,
+        integrator: str = "auto",
+        substeps: int | None = None,
+        reset_noise_scale: float = 0.05,
+        backend: str = "numba",
+        whole_state: bool = False,
+        render_mode: str | None = None,
+        **weights: float,
+    ) -> None:
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}: these environments do not draw")
+        if substeps is not None and (isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1):
+            raise ValueError(f"substeps must be a positive whole number or None, got {substeps!r}")
+        if not isinstance(whole_state, bool | np.bool_):
+            raise ValueError(f"whole_state must be True or False, got {whole_state!r}")
+        self.mechanism = in_the_plane(as_mechanism(mechanism))
+        self.task = tasks.get(task)
+        if problem := unfit(self.mechanism, self.task):
+            raise ValueError(problem)
+        self.params = self.mechanism.resolve(params)
+        self.dt = _positive("dt", dt)
+        self.torque_limits = self._torque_limits(torque_limits)
+        self.joint_limits = self._joint_limits(joint_limits)
+        self.reset_noise_scale = self._noise(reset_noise_scale)
+        self.weights = self._weights(weights)
+        self.scene = Scene(
+            self.mechanism,
+            self.task,
+            frame=frame,
+            stops=bool(self.joint_limits),
+            integrator=integrator,
+            substeps=substeps,
+            backend=backend,
+            whole_state=bool(whole_state),
+        )
+        self.numbers(self.params)  # refuses parameters with which the mechanism has no forward
+
+    def numbers(self, params: Mapping[str, float]) -> dict[str, float]:
+        """A value for each of the scene's parameters, for these parameters of the mechanism."""
+        forward = float(np.sign(evaluate(self.mechanism.forward, params)))
+        if forward == 0:
+            raise ValueError(
+                f"{self.mechanism.name}: with these parameters {self.mechanism.forward} = 0, and its gaits drive it "
+                "neither way; change a parameter"
+            )
+        return {**self.weights, **params, "dt": self.dt, "forward": forward}
+
+    @cached_property
+    def model(self) -> Model:
+        """The mechanism's functions in the scene's frame."""
+        return Model(self.mechanism, self.params, self.scene.frame)
+
+    @property
+    def action_space(self) -> gym.Space[NDArray[np.float32]]:
+        """Of one environment."""
+        return gym.spaces.Box(-1.0, 1.0, (len(self.mechanism.controls),), np.float32)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the model, which is made again."""
+        return {name: value for name, value in self.__dict__.items() if name != "model"}
+
+    # -- resets --------------------------------------------------------------------------------
+
+    def targets_given(self, options: Mapping[str, Any], mask: NDArray[np.bool_] | None = None) -> dict[str, Array]:
+        """Targets in the `options` of a reset, by name, each shape ().
+
+        With a `mask` of rows (N,), each may also be given as (N,); then it is returned for the rows of the mask.
+        """
+        given = options.get("target", {})
+        if not isinstance(given, Mapping):
+            raise ValueError(f"reset option 'target' must map targets to numbers, got {given!r}")
+        values = {}
+        for name, value in given.items():
+            if name not in self.task.targets:
+                raise ValueError(f"reset option 'target': {unknown_name('target', str(name), self.task.targets)}")
+            values[name] = _array(f"reset option 'target': {name}", value, (), mask)
+        return values
+
+    def state_given(self, options: Mapping[str, Any], key: str, mask: NDArray[np.bool_] | None = None) -> Array:
+        """Coordinates or velocities in the `options` of a reset, shape (n,); with a mask as for targets."""
+        names = ", ".join(self.mechanism.coordinates)
+        return _array(f"reset option {key!r} ({names})", options[key], (self.mechanism.n,), mask)
+
+    def check_stops(self, q: Array) -> None:
+        """Refuse coordinates (..., n) beyond a stop."""
+        for joint, limit in self.joint_limits.items():
+            angles = q[..., self.mechanism.coordinates.index(joint)]
+            if (np.abs(angles) > limit).any():
+                angle = float(np.ravel(angles)[np.argmax(np.abs(angles))])
+                raise ValueError(
+                    f"reset option 'q' has {joint} = {angle}, beyond its stop at {limit} rad; "
+                    "make the environment with joint_limits=False to go there"
+                )
+
+    # -- arguments -----------------------------------------------------------------------------
+
+    def _weights(self, given: Mapping[str, float]) -> dict[str, float]:
+        values = dict(self.task.weights)
+        for name, value in given.items():
+            if name not in values:
+                raise TypeError(f"{self.mechanism.name}, {self.task.name}: {unknown_name('argument', name, values)}")
+            values[name] = _number(name, value)
+            if not math.isfinite(values[name]):
+                raise ValueError(f"{name} must be finite, got {value}")
+        return values
+
+    def _torque_limits(self, given: Mapping[str, float] | ArrayLike | None) -> Array:
+        controls = self.mechanism.controls
+        values = {control: self.mechanism.torque_limits.get(control, 1.0) for control in controls}
+        if isinstance(given, Mapping):
+            for name, value in given.items():
+                if name not in values:
+                    raise ValueError(f"torque_limits: {unknown_name('control', str(name), controls)}")
+                values[name] = value
+        elif given is not None:
+            array = np.asarray(given, dtype=float)
+            if array.shape not in ((), (len(controls),)):
+                raise ValueError(f"torque_limits must be one number for each of {', '.join(controls)}, got {given!r}")
+            values = dict(zip(controls, np.broadcast_to(array, len(controls)), strict=True))
+        return np.array([_positive(f"torque limit of {name}", value) for name, value in values.items()])
+
+    def _joint_limits(self, given: bool | Mapping[str, float]) -> dict[str, float]:
+        values = dict(self.mechanism.joint_limits)
+        if isinstance(given, bool | np.bool_):
+            return values if given else {}
+        if not isinstance(given, Mapping):
+            raise ValueError(f"joint_limits must be True, False or a mapping of angles in rad, got {given!r}")
+        for name, value in given.items():
+            if name not in values:
+                raise ValueError(f"joint_limits: {unknown_name('joint', str(name), values)}")
+            values[name] = _positive(f"joint limit of {name}", value)
+        return values
+
+    def _noise(self, scale: float) -> float:
+        smallest, number = min(self.joint_limits.values(), default=math.inf), _number("reset_noise_scale", scale)
+        if not 0 <= number < smallest:
+            raise ValueError(f"reset_noise_scale must be at least 0 and below the stops at {smallest} rad, got {scale}")
+        return number
+
+
+def _array(what: str, value: Any, shape: tuple[int, ...], mask: NDArray[np.bool_] | None) -> Array:
+    """An array of finite numbers of this shape; or with a mask, perhaps one for each row, of the rows in it."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}") from None
+    shapes = [shape] if mask is None else [shape, (len(mask), *shape)]
+    if array.shape not in shapes:
+        raise ValueError(f"{what} must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
+    if mask is not None and array.shape != shape:
+        array = array[mask]
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} must be finite, got {reprlib.repr(array.tolist())}")
+    return array
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a number, got {value!r}") from None
+
+
+def _positive(name: str, value: Any) -> float:
+    number = _number(name, value)
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"{name} must be positive and finite, got {value!r}")
+    return number

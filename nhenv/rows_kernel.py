@@ -1,0 +1,611 @@
+"""The kernel of many environments side by side: loops over the rows of a block, as source.
+
+What a row goes through is the same text as in the kernel of one environment, and `nhenv.rows` drives the loops. Each
+loop reads and writes few arrays at constant distances, which is what lets LLVM turn it into vector code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from collections.abc import Iterable, Sequence
+
+from nhenv import random_streams, rows
+from nhenv.generate import Generator, included, items
+from nhenv.scene import BAD_ACTION, DIVERGED, LARGEST, RUNNING, TERMINATED, Scene
+
+__all__ = ["RowsKernel"]
+
+# Rows in a block: enough to hide the latency of long chains, few enough that the scratch fields stay in the first
+# cache. The stride between fields is not a power of two, lest all of them share the same few lines of that cache.
+ROWS, STRIDE = 128, 136
+
+
+class RowsKernel(Generator):
+    """Source of `step_rows`, `begin_rows` and `look_rows`.
+
+    Args:
+        scene: what to simulate.
+        varied: whether each row has parameters, torque limits and stops of its own.
+    """
+
+    def __init__(self, scene: Scene, *, varied: bool) -> None:
+        super().__init__(scene)
+        self.varied = varied
+        states = [state.name for state in self.flow.states]
+        controls = [control.name for control in self.equations.controls]
+        angles = [angle.name for angle, _ in self.joints]
+        rules = list(scene.task.targets) if scene.task else []
+        self.carried = self.program.carried(self.flow, self.method)
+        carried = list(self.carried)
+        own = {"k": [constant.name for constant in self.program.constants], "limit": controls, "stop": angles}
+        # Field -> its place: of what lasts, of what a step needs on its way, and of what holds for all rows.
+        lasting = {
+            "s": states,
+            "c": carried,
+            "t": [target.name for target in self.targets],
+            "steps": [""],
+            "over": [""],
+        }
+        self.lasting = _places({**lasting, **(own if varied else {})}, "p")
+        motion = {"x": states, "c": carried, "u": controls, "free": angles, "time": [""]}
+        judged = {
+            "a": controls,
+            "bad": [""],
+            "before": [state.name for state in self.remembered],
+            "o": [str(i) for i in range(len(self.observation))],
+            "reward": [""],
+            "status": [""],
+        }
+        search = ("hit", "search", "missed", "trial", "low", "high", "end", "side", "gap", "toward")
+        self.scratch = _places({**motion, **judged, **{name: [""] for name in search if angles}}, "w")
+        shared = {**({} if varied else own), **{name: [""] for name in ("dt", "noise", "max_steps", "mode")}}
+        shared["nothing"] = rules
+        self.shared = _places(shared, "n")
+
+    def module(self) -> str:
+        """Text of the generated module."""
+        strict, inline = self.backend, self.backend.inlined()
+        kind = "many environments, each with parameters of its own" if self.varied else "many environments"
+        parts = [
+            f'"""{self.title(kind)}"""\n\n{strict.header}{random_streams.IMPORTS}from numpy import empty, int64\n',
+            self._tables(),
+            self.constants(),
+            *self.functions(inline, 1, self.carried),
+            self.program.step_function(
+                "advance_states_twice", self.flow, self.method, 1, self.held, inline, self.carried, streams=2
+            ),
+            self.program.carry_function("carry", self.flow, self.carried, inline),
+            *(self.stop_functions(strict) if self.joints else []),
+            *self._constants(),
+            *included(random_streams.SOURCES, inline),
+            *self._loops(),
+            self._start_row(),
+            self._look_row(),
+            *self._driver(),
+        ]
+        return "\n\n".join(parts)
+
+    def advance(self, new: str, state: str, control: str, free: str) -> str:
+        """Lines that advance a state by `h`, through all substeps."""
+        carried = f"*carry({new}, k), " if self.carried else ""
+        step = f"{new}, = advance_states(h, {new}, {carried}{control}, {free}, k)"
+        return f"{new}, = {state},\nh = {self._share('h')}\nfor _ in range({self.substeps}):\n    {step}"
+
+    # -- names ---------------------------------------------------------------------------------
+
+    def _tables(self) -> str:
+        size = STRIDE * max(len(self.lasting), len(self.scratch))
+        return self.tables(
+            ROWS=ROWS,
+            STRIDE=STRIDE,
+            SIZE=STRIDE * len(self.lasting),
+            SCRATCH=size,
+            LASTING={name: STRIDE * i for name, i in self.lasting.items()},
+            SHARED=self.shared,
+        )
+
+    def _constants(self) -> list[str]:
+        """Places of the fields: unsigned in loops, where a negative one would have to be allowed for; else plain."""
+        fields = {**self.lasting, **self.scratch}
+        rules = self.scene.task.targets if self.scene.task else ()
+        lines = [f"{name} = uint64({STRIDE * i})\n" for name, i in fields.items()]
+        lines.append("EIGHT, SIXTEEN = uint64(8), uint64(16)\n")
+        plain = {
+            "SUBSTEPS": self.substeps, "JOINTS": len(self.joints), "N_STATES": len(self.flow.states),
+            "N_CONTROLS": len(self.actions), "N_OBSERVATIONS": len(self.observation),
+            "STATE": 0, "STEPS": STRIDE * self.lasting["steps__p"], "OVER": STRIDE * self.lasting["over__p"],
+            "DT": self.shared["dt__n"], "MAX_STEPS": self.shared["max_steps__n"], "MODE": self.shared["mode__n"],
+            "RUNNING": RUNNING, "DIVERGED": DIVERGED, "TERMINATED": TERMINATED,
+            "NOTHING": len(self.shared) - len(rules),
+            "NEXT_STEP": rows.NEXT_STEP, "SAME_STEP": rows.SAME_STEP,
+        }  # fmt: skip
+        first = {
+            "X": "x",
+            "CONTROL": "u",
+            "ACTION": "a",
+            "BAD": "bad",
+            "HIT": "hit",
+            "OBSERVED": "o",
+            "REWARD": "reward",
+        }
+        for name, kind in {**first, "STATUS": "status"}.items():
+            places = [i for field, i in self.scratch.items() if field.startswith(f"{kind}_")]
+            plain[name] = STRIDE * min(places, default=0)
+        lines += [f"{name} = {value!r}\n" for name, value in plain.items()]
+        lines += [f"{name} = {getattr(rows, name)!r}\n" for name in rows.CONSTANTS]
+        lines += [f"{name} = {getattr(random_streams, name)!r}\n" for name in random_streams.CONSTANTS]
+        return ["".join(lines)]
+
+    def _states(self, kind: str, array: str = "w") -> str:
+        """Source of the states in a field, separated and followed by commas."""
+        return _listed(f"{array}[{kind}_{state.name}__{array} + j]" for state in self.flow.states)
+
+    def _fields(self, kind: str, names: Iterable[str], array: str = "w") -> str:
+        return _listed(f"{array}[{kind}_{name}__{array} + j]" for name in names)
+
+    @property
+    def _aims(self) -> str:
+        return self._fields("t", (target.name for target in self.targets), "p")
+
+    @property
+    def _control_names(self) -> list[str]:
+        return [control.name for control in self.equations.controls]
+
+    @property
+    def _joint_names(self) -> list[str]:
+        return [angle.name for angle, _ in self.joints]
+
+    # -- loops ---------------------------------------------------------------------------------
+
+    def _own(self, kind: str, names: Sequence[str], j: str = "j") -> list[str]:
+        """Source of what a row has of its own, or shares with all."""
+        if self.varied:
+            return [f"p[{kind}_{name}__p + {j}]" for name in names]
+        return [f"numbers[{self.shared[f'{kind}_{name}__n']}]" for name in names]
+
+    def _known(self, j: str = "j") -> list[str]:
+        """Lines that put constants, limits and stops under short names."""
+        constants = self._own("k", [constant.name for constant in self.program.constants], j)
+        lines = [f"k = ({_listed(constants)})"]
+        limits = self._own("limit", self._control_names, j)
+        lines += [f"limit_{name} = {text}" for name, text in zip(self._control_names, limits, strict=True)]
+        stops = self._own("stop", self._joint_names, j)
+        return lines + [f"stop_{name} = {text}" for name, text in zip(self._joint_names, stops, strict=True)]
+
+    def _loop(
+        self,
+        name: str,
+        arguments: str,
+        body: Sequence[str],
+        total: str = "",
+        over: Sequence[str] = ("for j in range(uint64(count)):",),
+    ) -> str:
+        """Source of a function over the rows of a block; it may count some."""
+        lines, inner = [], list(body)
+        if "numbers" in arguments:
+            lines += [f"{name} = numbers[{self.shared[f'{name}__n']}]" for name in ("dt", "max_steps")]
+            lines, inner = (lines, self._known() + inner) if self.varied else (lines + self._known(), inner)
+        lines += [f"{total} = 0"] * bool(total)
+        indent = " " * (len(over[-1]) - len(over[-1].lstrip()) + 4)
+        lines += [*over, *(indent + line for line in inner)]
+        lines += [f"return {total}"] * bool(total)
+        text = textwrap.indent("\n".join(lines), "    ")
+        return f"{self.backend.decorator}def {name}({arguments}):\n{text}\n"
+
+    def _loops(self) -> list[str]:
+        block = "p, w, count, numbers"
+        actions = [action.name for action in self.actions]
+        observed = [str(i) for i in range(len(self.observation))]
+        changed = [f"(w[x_{v.name}__w + j] != p[s_{v.name}__p + j])" for _, v in self.joints if self.carried]
+        return [
+            self._loop(
+                "load_rows",
+                "w, count, actions",
+                [
+                    *(f"{action} = float(actions[j, {i}])" for i, action in enumerate(actions)),
+                    f"bad = {' | '.join(f'({action} != {action})' for action in actions)}",
+                    *(
+                        f"w[a_{control}__w + j] = clip(0.0 if bad else {action}, -1.0, 1.0)"
+                        for action, control in zip(actions, self._control_names, strict=True)
+                    ),
+                    f"w[bad__w + j] = {BAD_ACTION} if bad else {RUNNING}",
+                ],
+            ),
+            self._loop(
+                "prepare_rows",
+                block,
+                [
+                    *(f"{u} = limit_{u}*w[a_{u}__w + j]" for u in self._control_names),
+                    *(f"w[u_{u}__w + j] = {u}" for u in self._control_names),
+                    *self._settled(self._states("s", "p")),
+                    *(
+                        [f"{self._fields('c', self.carried)} = {self._fields('c', self.carried, 'p')}"]
+                        * bool(self.carried)
+                    ),
+                    f"w[time__w + j] = {self._share('dt')}",
+                    f"count_changed += 1 if {' | '.join(changed) or 'False'} else 0",
+                ],
+                "count_changed",
+            ),
+            self._advance_rows(block),
+            self._loop("see_rows", block, self._seen(self._states("x"))),
+            *(self._stop_loops() if self.joints else []),
+            self._finish(block),
+            self._inform(),
+            self._loop(
+                "emit_rows",
+                "w, count, observations, rewards",
+                [
+                    *(f"observations[j, {i}] = w[o_{i}__w + j]" for i in observed),
+                    "rewards[j] = w[reward__w + j]",
+                ],
+            ),
+        ]
+
+    def _carry(self) -> list[str]:
+        """Lines that work out what is carried from step to step."""
+        if not self.carried:
+            return []
+        return [f"{self._fields('c', self.carried)} = carry({self._states('x')}k)"]
+
+    def _seen(self, states: str) -> list[str]:
+        """Lines that work out what is carried and observed of states: together, as they have much in common."""
+        lines = [f"{self._fields('c', self.carried)} = carry({states}k)"] * bool(self.carried)
+        if self.observation:
+            seen = _listed(f"w[o_{i}__w + j]" for i in range(len(self.observation)))
+            lines.append(f"{seen} = observe({states}{self._aims}k)")
+        return lines or ["pass"]
+
+    def _share(self, time: str) -> str:
+        return f"{time}*{1 / self.substeps!r}" if self.substeps > 1 else time
+
+    def _advance_rows(self, block: str) -> str:
+        """The loop that moves: rows in pairs, eight and eight, each pair as two streams; surplus rows do no harm."""
+        states = [state.name for state in self.flow.states]
+
+        def fields(j: str) -> str:
+            text = (
+                f"w[time__w + j], {self._states('x')}{self._fields('c', self.carried)}"
+                f"{self._fields('u', self._control_names)}{self._fields('free', self._joint_names)}"
+            )
+            return text.replace("+ j]", f"+ {j}]")
+
+        new = [_listed(f"{name}__{i}" for name in states) for i in (0, 1)]
+        body = [f"{new[0]}{new[1]} = advance_states_twice({fields('j')}{fields('jj')}k)"]
+        for i, j in enumerate(("j", "jj")):
+            lines = [f"{self._states('x')} = {new[i]}", *self._seen(new[i])]
+            body += [line.replace("+ j]", f"+ {j}]") for line in lines]
+        places = ["j = pair*SIXTEEN + i", "jj = j + EIGHT"]
+        over = ("align_stack()", "for pair in range(uint64((count + 15)//16)):", "    for i in range(EIGHT):")
+        return self._loop("advance_rows", block, [*places, *body], over=over)
+
+    def _settled(self, states: str) -> list[str]:
+        """Lines that put states into the field x, joints settled on the stops that they are pressed against."""
+        if not self.joints:
+            return [f"{self._states('x')} = {states}"]
+        controls, stops = _listed(self._control_names), _listed(f"stop_{name}" for name in self._joint_names)
+        freed = self._fields("free", self._joint_names)
+        return [f"{self._states('x')}{freed} = settle_states({states}{controls}{stops}k)"]
+
+    def _stop_loops(self) -> list[str]:
+        """Loops of the way through impacts; those of a single joint follow `mechanics.compiler.stops.hold` closely."""
+        block = "p, w, count, numbers"
+        stops = _listed(f"stop_{name}" for name in self._joint_names)
+        screen = self._loop(
+            "screen_rows",
+            block,
+            [
+                f"clear = clear_joints(dt, {self._states('s', 'p')}{self._states('x')}"
+                f"{self._fields('free', self._joint_names)}{stops}k)",
+                "hit = (not clear) & (p[over__p + j] == 0.0)",
+                "w[hit__w + j] = 1.0 if hit else 0.0",
+                "hits += 1 if hit else 0",
+            ],
+            "hits",
+        )
+        parts = [self._settle_states(), screen, *self._moves()]
+        if len(self.joints) > 1:
+            return [*parts, *self._no_regular_rows()]
+        ((_, rate),), (name,) = self.joints, self._joint_names
+        controls = self._fields("u", self._control_names)
+        from_field = [f"{u} = w[u_{u}__w + j]" for u in self._control_names]
+        old = _listed(f"{state.name}__old" for state in self.flow.states)
+        free = f"free_{name}"
+        settle = f"{old}{free}, = settle_states({self._states('s', 'p')}{controls}stop_{name}, k)"
+        return [
+            *parts,
+            self._loop(
+                "bracket_rows",
+                block,
+                [
+                    settle,
+                    f"angle, rate = w[x_{name}__w + j], w[x_{rate.name}__w + j]",
+                    f"before = move_joints({old}{controls}k)",
+                    f"after = move_joints({self._states('x')}{controls}k)",
+                    # It turned on the way, perhaps beyond the stop that it went for first; or it ends beyond one.
+                    f"side = copysign(1.0, {rate.name}__old)",
+                    f"far = side*{name}__old + dt*fabs(before[0]) > stop_{name}",
+                    f"turned = ({rate.name}__old*rate < 0.0) & far",
+                    "side = side if turned else copysign(1.0, angle)",
+                    f"crossed = fabs(angle) > stop_{name}",
+                    f"regular = {free} != 0.0",
+                    f"gap, toward = side*{name}__old - stop_{name}, side*before[0]",
+                    f"low = -side*{rate.name}__old if turned else gap",
+                    f"high = -side*rate if turned else side*angle - stop_{name}",
+                    "low_rate = -side*before[1] if turned else toward",
+                    "high_rate = -side*after[1] if turned else side*after[0]",
+                    "met = turned | crossed",
+                    "w[trial__w + j] = guess(low, high, low_rate, high_rate, dt) if met else dt",
+                    "w[low__w + j], w[high__w + j], w[end__w + j] = 0.0, dt, dt",
+                    "w[side__w + j], w[gap__w + j], w[toward__w + j] = side, gap, toward",
+                    "w[missed__w + j] = 0.0 if met else 1.0",
+                    "search = TURN if turned else (CROSSING if crossed else LAST)",
+                    "w[search__w + j] = search if regular else 0.0",
+                    "w[hit__w + j] = 0.0 if regular else 1.0",
+                    "count_regular += 1 if regular else 0",
+                ],
+                "count_regular",
+            ),
+            self._loop(
+                "rewind_rows",
+                block,
+                [
+                    *from_field,
+                    *self._settled(self._states("s", "p")),
+                    *self._carry(),
+                    f"w[time__w + j] = {self._share('w[trial__w + j]')}",
+                ],
+            ),
+            self._loop(
+                "refine_rows",
+                block,
+                [
+                    f"angle, rate = w[x_{name}__w + j], w[x_{rate.name}__w + j]",
+                    f"motion = move_joints({self._states('x')}{controls}k)",
+                    "search, side, trial = w[search__w + j], w[side__w + j], w[trial__w + j]",
+                    "low, high, end = w[low__w + j], w[high__w + j], w[end__w + j]",
+                    "turning = search == TURN",
+                    f"over = side*angle - stop_{name}",
+                    "value = -side*rate if turning else over",
+                    "slope = -side*motion[1] if turning else side*motion[0]",
+                    "better, low_, high_ = refine(trial, low, high, value, slope, end)",
+                    "found = better == trial",
+                    # Where it turned: beyond the stop, so look for the crossing before; or it never got there.
+                    "beyond, missed = turning & found & (over > 0.0), turning & found & (over <= 0.0)",
+                    "crossing = guess(w[gap__w + j], over, w[toward__w + j], side*motion[0], trial)",
+                    "searching = search != 0.0",
+                    "w[low__w + j] = 0.0 if beyond else (low_ if searching else low)",
+                    "w[high__w + j] = trial if beyond else (high_ if searching else high)",
+                    "w[end__w + j] = trial if beyond else end",
+                    "w[missed__w + j] = 1.0 if missed else w[missed__w + j]",
+                    "trial = dt if missed else (crossing if beyond else (better if searching else trial))",
+                    "w[trial__w + j] = trial",
+                    f"w[hit__w + j] = 1.0 if (search == LAST) & (fabs(angle) > stop_{name}) else w[hit__w + j]",
+                    "search = 0.0 if found | (search == LAST) else search",
+                    "search = LAST if missed else (CROSSING if beyond else search)",
+                    "w[search__w + j] = search",
+                    "count_open += 1 if search != 0.0 else 0",
+                ],
+                "count_open",
+            ),
+            self._loop(
+                "land_rows",
+                block,
+                [
+                    *from_field,
+                    f"angle, rate = w[x_{name}__w + j], w[x_{rate.name}__w + j]",
+                    "missed = w[missed__w + j] != 0.0",
+                    f"w[x_{name}__w + j], w[x_{rate.name}__w + j] = copysign(stop_{name}, angle), 0.0",
+                    *self._settled(self._states("x")),
+                    # Nothing is left of a flight that met no stop; as it ended, so it stays.
+                    f"w[x_{name}__w + j] = angle if missed else w[x_{name}__w + j]",
+                    f"w[x_{rate.name}__w + j] = rate if missed else w[x_{rate.name}__w + j]",
+                    f"w[free_{name}__w + j] = 1.0 if missed else w[free_{name}__w + j]",
+                    *self._carry(),
+                    f"w[time__w + j] = {self._share('(dt - w[trial__w + j])')}",
+                ],
+            ),
+            self._loop(
+                "check_rows",
+                block,
+                [
+                    f"again = (w[free_{name}__w + j] != 0.0) & (fabs(w[x_{name}__w + j]) > stop_{name})",
+                    "irregular = again | (w[hit__w + j] != 0.0) | (w[search__w + j] != 0.0)",
+                    "w[hit__w + j] = 1.0 if irregular else 0.0",
+                    "count_irregular += 1 if irregular else 0",
+                ],
+                "count_irregular",
+            ),
+        ]
+
+    def _moves(self) -> list[str]:
+        """Loops that bring rows into the spare block, and back."""
+        kinds = [("x", [state.name for state in self.flow.states]), *((kind, self._control_names) for kind in "ua")]
+        needed = [f"{kind}_{name}__w" for kind, names in kinds for name in names] + ["bad__w"]
+        observed = range(len(self.observation))
+        return [
+            self._loop(
+                "take_rows",
+                "p, w, count, rows, spare, v, held",
+                [
+                    "row, j = rows[i], uint64(held) + i",
+                    *(f"spare[{field} + j] = p[{field} + row]" for field in self.lasting),
+                    *(f"v[{field} + j] = w[{field} + row]" for field in needed),
+                ],
+                over=("for i in range(uint64(count)):",),
+            ),
+            self._loop(
+                "give_rows",
+                "v, count, rows, observations, rewards",
+                [
+                    "row = rows[j]",
+                    *(f"observations[row, {i}] = v[o_{i}__w + j]" for i in observed),
+                    "rewards[row] = v[reward__w + j]",
+                ],
+            ),
+            self._loop(
+                "put_rows",
+                "spare, count, rows, blocks",
+                [
+                    f"block, row = rows[j] // uint64({ROWS}), rows[j] % uint64({ROWS})",
+                    *(f"blocks[block, {field} + row] = spare[{field} + j]" for field in self.lasting),
+                ],
+            ),
+        ]
+
+    def _no_regular_rows(self) -> list[str]:
+        """With several joints, every impact is left to `hold`."""
+        block = "p, w, count, numbers"
+        counted = [self._loop(f"{name}_rows", block, ["total += 0"], "total") for name in ("bracket", "refine")]
+        counted.append(self._loop("check_rows", block, ["total += 1"], "total"))
+        return [*counted, *(self._loop(f"{name}_rows", block, ["pass"]) for name in ("rewind", "land"))]
+
+    def _settle_states(self) -> str:
+        """`mechanics.compiler.stops.settle` without branches: the states settled, and whether each joint is free."""
+        states = [state.name for state in self.flow.states]
+        lines = []
+        for j, (angle, rate) in enumerate(self.joints):
+            a, v = angle.name, rate.name
+            lines += [
+                f"at = fabs({a}) >= _stop_{a}",
+                f"{a} = copysign(_stop_{a}, {a}) if at else {a}",
+                f"pressed = at & ({v}*{a} >= 0.0)",
+                f"{v} = 0.0 if pressed else {v}",
+                f"push = move_joints({_listed(states)}{_listed(self._control_names)}_k)[{len(self.joints) + j}]",
+                f"_free_{a} = 0.0 if pressed & (push*{a} >= 0.0) else 1.0",
+            ]
+        frees = _listed(f"_free_{name}" for name in self._joint_names)
+        lines.append(f"return ({_listed(states)}{frees})")
+        arguments = (
+            f"{_listed(states)}{_listed(self._control_names)}{_listed(f'_stop_{n}' for n in self._joint_names)}_k"
+        )
+        body = textwrap.indent("\n".join(lines), "    ")
+        return f"{self.backend.inline}def settle_states({arguments}):\n{body}\n"
+
+    def _finish(self, block: str) -> str:
+        """The loop that judges the outcome: what `step` of the kernel of one environment does after the motion."""
+        states = [state.name for state in self.flow.states]
+        new, old = (_listed(f"{name}__{when}" for name in states) for when in ("new", "old"))
+        lines = [
+            f"{old} = {self._states('s', 'p')}",
+            f"{new} = {self._states('x')}",
+            f"good = {' & '.join(f'(fabs({name}__new) < {LARGEST})' for name in states)}",
+            *(f"{name}__new = {name}__new if good else {name}__old" for name in states),
+            f"{self._states('s', 'p')} = {new}",
+            f"{self._states('x')} = {new}",
+            *(f"w[before_{state.name}__w + j] = {state.name}__old" for state in self.remembered),
+        ]
+        lines += [f"p[c_{c}__p + j] = w[c_{c}__w + j] if good else p[c_{c}__p + j]" for c in self.carried]
+        lines.append(f"status = w[bad__w + j] if good else {DIVERGED}")
+        if self.ending:
+            lines += [
+                f"over = good & (ends({new}{self._aims}k)[0] > 0.0)",
+                f"status = {TERMINATED} if over else status",
+            ]
+        rewards = [i for i, name in enumerate(self.judgement) if name.startswith("reward:")]
+        lines += [
+            f"judged = {self._judge(new, old, '(1.0 if over else 0.0)')}",
+            f"w[reward__w + j] = {' + '.join(f'judged[{i}]' for i in rewards) or '0.0'}",
+            "w[status__w + j] = status",
+            "steps = p[steps__p + j] + 1.0",
+            "p[steps__p + j] = steps",
+            f"due = (status != {RUNNING}) | (w[bad__w + j] != {RUNNING}) | (p[over__p + j] != 0.0)",
+            "due = due | (steps >= max_steps)",
+            "busy += 1 if due else 0",
+        ]
+        return self._loop("finish_rows", block, lines, "busy")
+
+    def _judge(self, new: str, old: str, over: str) -> str:
+        actions = self._fields("a", self._control_names)
+        return f"judge({new}{old}{actions}{self._aims}{over + ', ' if self.ending else ''}k)"
+
+    def _inform(self) -> str:
+        """The loop that works out rewards and info one by one, for those who ask."""
+        before = _listed(f"w[before_{s.name}__w + j]" if s in self.remembered else "0.0" for s in self.flow.states)
+        over = f"(1.0 if w[status__w + j] == {TERMINATED} else 0.0)"
+        lines = [
+            f"values = {self._judge(self._states('x'), before, over)}",
+            *(f"judged[{i}, start + int64(j)] = values[{i}]" for i in range(len(self.judgement))),
+        ]
+        return self._loop("inform_rows", "p, w, count, numbers, judged, start", lines)
+
+    # -- rows ----------------------------------------------------------------------------------
+
+    def _start_row(self) -> str:
+        """The beginning of an episode: the next numbers of the row's own stream, and nothing else at random."""
+        rules = list(self.scene.task.targets) if self.scene.task else []
+        drawn = [f"_u{i}" for i in range(self.scene.draws)]
+        given = [f"given[{i}]" for i in range(len(rules))]
+        values = _listed((*drawn, f"numbers[{self.shared['noise__n']}]", *given))
+        states, noisy = [state.name for state in self.flow.states], self.scene.noisy
+        lines = [
+            *(f"{name} = uniform(streams, row)" for name in drawn),
+            *self._known(),
+            f"started = start({values}k)",
+            *(f"p[s_{state}__p + j] = 0.0" for state in states),
+            *(f"p[s_{name}__p + j] = started[{i}]" for i, name in enumerate(noisy) if name in states),
+            *(f"p[t_{t.name}__p + j] = started[{len(noisy) + i}]" for i, t in enumerate(self.targets)),
+            "p[steps__p + j] = 0.0",
+            "p[over__p + j] = 0.0",
+        ]
+        body = textwrap.indent("\n".join(["j = uint64(j)", *lines]), "    ")
+        return f"{self.backend.decorator}def start_row(p, j, streams, row, numbers, given):\n{body}\n"
+
+    def _look_row(self) -> str:
+        seen = items("observation", len(self.observation))
+        lines = [
+            "j = uint64(j)",
+            *self._known(),
+            *([f"{self._fields('c', self.carried, 'p')} = carry({self._states('s', 'p')}k)"] * bool(self.carried)),
+            f"{seen}, = observe({self._states('s', 'p')}{self._aims}k)" if seen else "pass",
+        ]
+        body = textwrap.indent("\n".join(lines), "    ")
+        return f"{self.backend.decorator}def look_row(p, j, numbers, observation):\n{body}\n"
+
+    def _held_numbers(self) -> str:
+        """What `hold` takes: constants and stops of a row."""
+        stops = _listed(f"stop_{name}" for name in self._joint_names)
+        lines = ["j = uint64(j)", *self._known(), f"return k, ({stops})"]
+        body = textwrap.indent("\n".join(lines), "    ")
+        return f"{self.backend.decorator}def held_numbers(p, j, numbers):\n{body}\n"
+
+    def _driver(self) -> list[str]:
+        """What `nhenv.rows` says, for this scene."""
+        entry = self.backend.decorator.replace("@njit(", "@njit(nogil=True, cache=CACHE__, ")
+        entries = (rows.step_rows, rows.begin_rows, rows.look_rows)
+        parts = [self._held_numbers()] if self.joints else [_NO_STOPS.replace("@", self.backend.inline)]
+        for function in rows.SOURCES:
+            if self.joints or function not in rows.STOPS:
+                backend = dataclasses.replace(self.backend, decorator=entry) if function in entries else self.backend
+                parts += included([function], backend)
+        return parts
+
+
+# A scene without joints has no impacts.
+_NO_STOPS = """@def screen_rows(p, w, count, numbers):
+    return 0
+
+
+@def gather_rows(p, w, count, start, spare, v, held, places, own):
+    return held
+
+
+@def through_impacts(
+    blocks, streams, spare, v, count, places, numbers, observations, rewards, terminated, truncated, finals, judged,
+    flags,
+):
+    return 0
+"""
+
+
+def _places(fields: dict[str, list[str]], array: str) -> dict[str, int]:
+    """Number of each field: KIND_NAME__ARRAY, which no name of a user's can meet, to its place."""
+    names = [
+        f"{kind}_{name}__{array}" if name else f"{kind}__{array}" for kind, each in fields.items() for name in each
+    ]
+    return {name: i for i, name in enumerate(names)}
+
+
+def _listed(items: Iterable[str]) -> str:
+    return "".join(f"{item}, " for item in items)
