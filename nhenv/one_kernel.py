@@ -23,7 +23,7 @@ class OneKernel(Generator):
             f'"""{self.title("one environment")}"""\n\n{self.backend.header}',
             self._tables(),
             self.constants(),
-            *self.functions(self.backend, self.substeps),
+            *self.functions(self.backend.inlined(), self.substeps),
             *(self.stop_functions(self.backend) if self.joints else []),
             self._begin(),
             self._respond(),

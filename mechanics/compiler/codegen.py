@@ -186,16 +186,20 @@ class Program:
         stages = [_Stage(self, body, flow, method, i, start) for i in range(method.stages)]
         for stage in stages:
             stage.others = stages
-        for layer in flow.layers:
-            if layer.kind == "core":  # stage by stage
-                for stage in stages:
-                    for state in layer.states:
-                        stage.rate(state)
-            for state in layer.states:
-                if layer.kind == "exact":
-                    end[state] = body.polynomial(state, "_h", start)
-                else:
-                    end[state] = body.moved(state.name, method.b, stages, methodcaller("rate", state))
+        integrated_states = [state for state in flow.states if state not in flow.solutions]
+        for state in flow.solutions:
+            end[state] = body.polynomial(state, "_h", start)
+        if method.explicit:
+            end |= {state: state.name for state in integrated_states}
+            for stage, weight in zip(stages, method.b, strict=True):
+                for state in integrated_states:
+                    rate = stage.rate(state)
+                    if weight:  # summed up on the way, lest all rates be kept until the end
+                        total = backend.sum_of_products([(repr(weight), rate)], end[state])
+                        end[state] = body.assign(f"_e_{state.name}{stage.suffix}", total)
+        else:  # layer after layer
+            for state in integrated_states:
+                end[state] = body.moved(state.name, method.b, stages, methodcaller("rate", state))
         names = [state.name for state in flow.states]
         arguments = ["_h", *names, *carried, *(symbol.name for symbol in held)]
         lines, values = body.text(), [end[state] for state in flow.states]
