@@ -14,7 +14,7 @@ what the generated module defines itself.
 
 from typing import Any
 
-from numpy import empty, uint64
+from numpy import empty, int64, uint64
 
 from mechanics.compiler.stops import hold
 
@@ -86,41 +86,38 @@ def step_rows(
     """Step the rows of some blocks, and start the episodes that are due; return what happened, as bits."""
     w, v, spare = scratch[0], scratch[1], scratch[2]
     places, own = empty(ROWS, uint64), empty(ROWS + 1, uint64)  # row of each place of the spare block, and of a block
-    events, held, size = 0, 0, len(rewards)
-    for b in range(first, last):
-        p, start = blocks[b], b * ROWS
-        count = min(ROWS, size - start)
-        end = start + count
-        load_rows(w, count, actions[start:end])
-        if prepare_rows(p, w, count, numbers) > 0:
-            see_rows(p, w, count, numbers)
-        for _ in range(SUBSTEPS):
-            advance_rows(p, w, count, numbers)
-        if JOINTS > 0:
+    # Plain integers, lest Numba compile everything once more for the constant 0.
+    events, held, size = int64(0), int64(0), len(rewards)
+    for b in range(first, last + 1):  # one round more, for what is left in the spare block
+        p, start = blocks[min(b, last - 1)], b * ROWS
+        count = min(ROWS, size - start) if b < last else int64(0)
+        end, hits = start + count, int64(0)
+        if count > 0:
+            load_rows(w, count, actions[start:end])
+            if prepare_rows(p, w, count, numbers) > 0:
+                see_rows(p, w, count, numbers)
+            for _ in range(SUBSTEPS):
+                advance_rows(p, w, count, numbers)
             hits = screen_rows(p, w, count, numbers)
-            if held + hits > ROWS:
-                events |= through_impacts(
-                    blocks, streams, spare, v, held, places, numbers, observations, rewards, terminated, truncated,
-                    finals, judged, flags,
-                )  # fmt: skip
-                held = 0
-            if hits > 0:
-                held = gather_rows(p, w, count, start, spare, v, held, places, own)
-        busy = finish_rows(p, w, count, numbers)
-        emit_rows(w, count, observations[start:end], rewards[start:end])
-        if judged.shape[1] > 0:
-            inform_rows(p, w, count, numbers, judged, start)
-        if busy > 0:
-            for j in range(count):
-                own[j] = start + j
-            events |= end_episodes(
-                p, w, count, own, streams, numbers, observations, rewards, terminated, truncated, finals, flags
-            )
-    if held > 0:
-        events |= through_impacts(
-            blocks, streams, spare, v, held, places, numbers, observations, rewards, terminated, truncated, finals,
-            judged, flags,
-        )  # fmt: skip
+        if held > 0 and (held + hits > ROWS or b == last):
+            events |= through_impacts(
+                blocks, streams, spare, v, held, places, numbers, observations, rewards, terminated, truncated, finals,
+                judged, flags,
+            )  # fmt: skip
+            held = int64(0)
+        if hits > 0:
+            held = gather_rows(p, w, count, start, spare, v, held, places, own)
+        if count > 0:
+            busy = finish_rows(p, w, count, numbers)
+            emit_rows(w, count, observations[start:end], rewards[start:end])
+            if judged.shape[1] > 0:
+                inform_rows(p, w, count, numbers, judged, start)
+            if busy > 0:
+                for j in range(count):
+                    own[j] = start + j
+                events |= end_episodes(
+                    p, w, count, own, streams, numbers, observations, rewards, terminated, truncated, finals, flags
+                )
     return events
 
 
@@ -128,7 +125,7 @@ def gather_rows(
     p: Array, w: Array, count: int, start: int, spare: Array, v: Array, held: int, places: Array, own: Array
 ) -> int:
     """Append the rows that may have met a stop to the spare block, with their state as if there were none."""
-    found = 0
+    found = int64(0)
     for j in range(count):  # without a branch, which would be predicted wrongly for most of them
         own[found] = j
         found += 1 if w[HIT + j] != 0.0 else 0
