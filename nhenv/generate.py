@@ -322,7 +322,11 @@ def _joint(equations: ReducedEquations, joint: str) -> tuple[sp.Symbol, sp.Symbo
 
 def included(sources: Iterable[Callable[..., Any]], backend: Backend) -> list[str]:
     """Source of functions that a generated module takes in whole."""
-    return [backend.decorator + inspect.getsource(function).replace(": Array", "") for function in sources]
+    return [
+        backend.decorator
+        + inspect.getsource(function).replace(": Array", "").replace(": Count", "").replace(" -> Count", "")
+        for function in sources
+    ]
 
 
 def items(array: str, count: int, start: int = 0) -> str:

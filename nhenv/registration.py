@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 ENTRY_POINT = "nhenv.env:LocomotionEnv"
+VECTOR_ENTRY_POINT = "nhenv.vector_env:LocomotionVectorEnv"
 
 MechanismLike = Mechanism | Mapping[str, Any] | str | os.PathLike[str]
 TaskLike = Task | Mapping[str, Any] | str
@@ -160,6 +161,7 @@ def _register(name: str, mechanism: str | dict[str, Any], task: str | dict[str, 
     gym.register(
         id=name,
         entry_point=ENTRY_POINT,
+        vector_entry_point=VECTOR_ENTRY_POINT,
         max_episode_steps=steps,
         # The environment refuses a step before reset itself, and the test suite runs Gymnasium's
         # checker on every task: two wrappers less around each step.

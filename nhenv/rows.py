@@ -21,6 +21,7 @@ from mechanics.compiler.stops import hold
 __all__ = ["SOURCES", "STOPS", "begin_rows", "look_rows", "step_rows"]
 
 Array = Any  # NumPy array, or Numba's view of one
+Count = Any  # whole number, Python's or NumPy's
 
 ROWS = STRIDE = SUBSTEPS = JOINTS = 0
 RUNNING, DIVERGED, TERMINATED = 0.0, 2.0, 4.0
@@ -82,7 +83,7 @@ def step_rows(
     flags: Array,
     first: int,
     last: int,
-) -> int:
+) -> Count:
     """Step the rows of some blocks, and start the episodes that are due; return what happened, as bits."""
     w, v, spare = scratch[0], scratch[1], scratch[2]
     places, own = empty(ROWS, uint64), empty(ROWS + 1, uint64)  # row of each place of the spare block, and of a block
@@ -122,8 +123,8 @@ def step_rows(
 
 
 def gather_rows(
-    p: Array, w: Array, count: int, start: int, spare: Array, v: Array, held: int, places: Array, own: Array
-) -> int:
+    p: Array, w: Array, count: Count, start: Count, spare: Array, v: Array, held: Count, places: Array, own: Array
+) -> Count:
     """Append the rows that may have met a stop to the spare block, with their state as if there were none."""
     found = int64(0)
     for j in range(count):  # without a branch, which would be predicted wrongly for most of them
@@ -140,7 +141,7 @@ def through_impacts(
     streams: Array,
     spare: Array,
     v: Array,
-    count: int,
+    count: Count,
     places: Array,
     numbers: Array,
     observations: Array,
@@ -150,7 +151,7 @@ def through_impacts(
     finals: Array,
     judged: Array,
     flags: Array,
-) -> int:
+) -> Count:
     """Do again the step of the rows in the spare block, through their impacts, and put them back."""
     irregular = count
     if JOINTS == 1:
@@ -206,7 +207,7 @@ def through_impacts(
 def end_episodes(
     p: Array,
     w: Array,
-    count: int,
+    count: Count,
     rows: Array,
     streams: Array,
     numbers: Array,
@@ -216,7 +217,7 @@ def end_episodes(
     truncated: Array,
     finals: Array,
     flags: Array,
-) -> int:
+) -> Count:
     """Report the episodes of a block that are over and start those that are due, as the mode of autoreset says."""
     events = 0
     for j in range(count):

@@ -10,6 +10,7 @@ import dataclasses
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from mechanics.compiler.backends import Backend
 from nhenv import random_streams, rows
 from nhenv.generate import Generator, included, items
 from nhenv.scene import BAD_ACTION, DIVERGED, LARGEST, RUNNING, TERMINATED, Scene
@@ -72,9 +73,7 @@ class RowsKernel(Generator):
             self._tables(),
             self.constants(),
             *self.functions(inline, 1, self.carried),
-            self.program.step_function(
-                "advance_states_twice", self.flow, self.method, 1, self.held, inline, self.carried, streams=2
-            ),
+            *([] if self.varied else [self._twice(inline)]),
             self.program.carry_function("carry", self.flow, self.carried, inline),
             *(self.stop_functions(strict) if self.joints else []),
             *self._constants(),
@@ -85,6 +84,12 @@ class RowsKernel(Generator):
             *self._driver(),
         ]
         return "\n\n".join(parts)
+
+    def _twice(self, backend: Backend) -> str:
+        """Source of `advance_states_twice`, which advances two rows in turn, operation by operation."""
+        return self.program.step_function(
+            "advance_states_twice", self.flow, self.method, 1, self.held, backend, self.carried, streams=2
+        )
 
     def advance(self, new: str, state: str, control: str, free: str) -> str:
         """Lines that advance a state by `h`, through all substeps."""
@@ -261,24 +266,28 @@ class RowsKernel(Generator):
         return f"{time}*{1 / self.substeps!r}" if self.substeps > 1 else time
 
     def _advance_rows(self, block: str) -> str:
-        """The loop that moves: rows in pairs, eight and eight, each pair as two streams; surplus rows do no harm."""
+        """The loop that moves: rows in pairs, eight and eight, each pair as two streams; surplus rows do no harm.
+
+        Rows that have constants of their own go one by one: two sets of these would not leave room for anything else.
+        """
         states = [state.name for state in self.flow.states]
-
-        def fields(j: str) -> str:
-            text = (
-                f"w[time__w + j], {self._states('x')}{self._fields('c', self.carried)}"
-                f"{self._fields('u', self._control_names)}{self._fields('free', self._joint_names)}"
-            )
-            return text.replace("+ j]", f"+ {j}]")
-
         new = [_listed(f"{name}__{i}" for name in states) for i in (0, 1)]
-        body = [f"{new[0]}{new[1]} = advance_states_twice({fields('j')}{fields('jj')}k)"]
-        for i, j in enumerate(("j", "jj")):
-            lines = [f"{self._states('x')} = {new[i]}", *self._seen(new[i])]
-            body += [line.replace("+ j]", f"+ {j}]") for line in lines]
-        places = ["j = pair*SIXTEEN + i", "jj = j + EIGHT"]
+        old = (
+            f"w[time__w + j], {self._states('x')}{self._fields('c', self.carried)}"
+            f"{self._fields('u', self._control_names)}{self._fields('free', self._joint_names)}"
+        )
+        outcome = [[f"{self._states('x')} = {each}", *self._seen(each)] for each in new]
+        if self.varied:
+            return self._loop("advance_rows", block, [f"{new[0]} = advance_states({old}k)", *outcome[0]])
+        body = [
+            "j = pair*SIXTEEN + i",
+            "jj = j + EIGHT",
+            f"{new[0]}{new[1]} = advance_states_twice({old}{old.replace('+ j]', '+ jj]')}k)",
+            *outcome[0],
+            *(line.replace("+ j]", "+ jj]") for line in outcome[1]),
+        ]
         over = ("align_stack()", "for pair in range(uint64((count + 15)//16)):", "    for i in range(EIGHT):")
-        return self._loop("advance_rows", block, [*places, *body], over=over)
+        return self._loop("advance_rows", block, body, over=over)
 
     def _settled(self, states: str) -> list[str]:
         """Lines that put states into the field x, joints settled on the stops that they are pressed against."""

@@ -25,7 +25,7 @@ from rich.console import Console
 
 from training import config as settings_of
 from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id, training_seed
-from training.evaluate import METRICS, Controller, Rollout, evaluate, load_policy, locomotion, make_envs, summary
+from training.evaluate import METRICS, Controller, Rollout, evaluate, load_policy, make_envs, summary
 from training.gaits import gait_path, sinusoid, tune_piece
 from training.plots import GAITS, POLICY, Shown, draw
 from training.progress import Job, run_jobs
@@ -115,13 +115,13 @@ def compare(options: Compare, command: Sequence[str], console: Console) -> dict[
 def judge(env_id: str, options: Compare) -> dict[str, Any]:
     """Evaluate the gaits and the policies on one environment, and draw its figure."""
     config, out, name = options.config(env_id), options.out, env_id.rpartition("/")[2]
-    env = make_envs(env_id, 1)[0]
+    envs = make_envs(env_id, 1)
     shown: list[Shown] = []
     gaits, policies, curves = {}, [], {}
     for label, gait in config.gaits.items():
         path = gait_path(env_id, gait, out)
         tuned = read_json(path)["result"]
-        episodes, gaits[label] = _judged(sinusoid(env, gait, tuned["vector"]), env_id, config, path, tuned)
+        episodes, gaits[label] = _judged(sinusoid(envs, gait, tuned["vector"]), env_id, config, path, tuned)
         shown.append(Shown(label, GAITS[len(shown)], episodes))
     for seed in options.seeds:
         path = ppo_path(env_id, config.ppo, seed, out)
@@ -132,7 +132,7 @@ def judge(env_id: str, options: Compare) -> dict[str, Any]:
         if len(policies) == 1:  # the first seed, not the best one
             shown.append(Shown(f"PPO, seed {seed}", POLICY, episodes))
     reached = {label: gait["distance_m"]["mean"] for label, gait in gaits.items()}
-    draw(out / f"{name}.png", name, locomotion(env), shown, curves, reached)
+    draw(out / f"{name}.png", name, envs, shown, curves, reached)
     distances = [policy["distance_m"]["mean"] for policy in policies]
     return {
         "config": dataclasses.asdict(config),

@@ -5,7 +5,7 @@ python -m training.evaluate runs/compare/SnakeboardForward-v0/ppo-seed0-01234567
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,7 +19,7 @@ from rich.table import Table
 
 from mechanics.expressions import evaluate as value_of
 from mechanics.mechanism import Mechanism
-from nhenv.env import LocomotionEnv
+from nhenv.vector_env import LocomotionVectorEnv
 from training.config import EVALUATION_SEEDS, EvaluationConfig, check_env_id
 from training.store import read_json
 
@@ -34,7 +34,6 @@ __all__ = [
     "evaluate",
     "joint_index",
     "load_policy",
-    "locomotion",
     "make_envs",
     "measure",
     "rollout",
@@ -42,7 +41,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Env = gym.Env[NDArray[np.float32], NDArray[np.float32]]
 
 METRICS = ("distance_m", "energy_j", "cost_of_transport", "return")
 GRAVITY = 9.81  # m/s²; only the cost of transport uses it
@@ -78,8 +76,8 @@ class Rollout:
 
     Attributes:
         returns: sums of rewards, shape (N,).
-        q: coordinates before each step and after the last, shape (N, T + 1, n).
-        torques: torques that were held, in N m, shape (N, T, m).
+        q: coordinates before each step and after the last, shape (N, T + 1, n); after an episode's end its last ones.
+        torques: torques that were held, in N m, shape (N, T, m); zero after an episode's end.
     """
 
     returns: Array
@@ -87,47 +85,45 @@ class Rollout:
     torques: Array
 
 
-def make_envs(env_id: str, count: int, **options: Any) -> list[Env]:
-    """Environments to run in lockstep."""
-    return [gym.make(check_env_id(env_id), **options) for _ in range(count)]
+def make_envs(env_id: str, count: int, **options: Any) -> LocomotionVectorEnv:
+    """Environments to run in lockstep; with `whole_state=True` their coordinates can be recorded."""
+    envs = gym.make_vec(check_env_id(env_id), count, **options)
+    assert isinstance(envs, LocomotionVectorEnv)
+    return envs
 
 
-def locomotion(env: Env) -> LocomotionEnv:
-    """The environment inside its wrappers."""
-    inner = env.unwrapped
-    assert isinstance(inner, LocomotionEnv)
-    return inner
-
-
-def rollout(controller: Controller, envs: Sequence[Env], seeds: Sequence[int], *, record: bool = True) -> Rollout:
-    """Run one episode in each environment.
+def rollout(controller: Controller, envs: LocomotionVectorEnv, seeds: Sequence[int], *, record: bool = True) -> Rollout:
+    """Run one episode in each environment, to the last bit as it would run alone.
 
     Args:
         controller: what drives them.
-        envs: N environments.
+        envs: N environments, whose episodes are reset by the step after the last.
         seeds: N seeds of their resets.
-        record: whether to keep q and torques; without them (T = 0) it is several times faster.
+        record: whether to keep q and torques, which needs environments made with `whole_state=True`. Without them
+            (T = 0) it is faster.
     """
-    inner = [locomotion(env) for env in envs]
-    limits = np.array([env.torque_limits for env in inner])
-    controller.reset(len(envs))
-    observations = np.stack([env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)])
-    returns = np.zeros(len(envs))
-    q = [[env.q for env in inner]]
-    torques = [np.empty((len(envs), 0, len(limits[0])))]
-    alive = [True] * len(envs)
-    while any(alive):
+    controller.reset(envs.num_envs)
+    observations, _ = envs.reset(seed=list(seeds))
+    q = [envs.q]
+    if record and np.isnan(q[0]).any():
+        raise ValueError(
+            "these environments do not follow every coordinate: make them with whole_state=True, or give record=False"
+        )
+    returns = np.zeros(envs.num_envs)
+    torques = [np.empty((envs.num_envs, 0, len(envs.mechanism.controls)))]
+    running = np.ones(envs.num_envs, bool)  # the others are in another episode, which does not count
+    while running.any():
         actions = controller(observations)
-        for i in (i for i, running in enumerate(alive) if running):
-            observations[i], reward, terminated, truncated, info = envs[i].step(actions[i])
-            if info.get("diverged"):
-                raise FloatingPointError(f"the episode with seed {seeds[i]} diverged after actions {actions[i]}")
-            returns[i] += float(reward)
-            alive[i] = not (terminated or truncated)
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        if infos:
+            _raise_failure(infos, running, seeds, actions)
+        returns[running] += rewards[running]
         if record:
-            q.append([env.q for env in inner])
-            torques.append((np.clip(actions, -1, 1) * limits)[:, None])
-    return Rollout(returns, np.swapaxes(q, 0, 1), np.concatenate(torques, axis=1))
+            q.append(np.where(running[:, None], envs.q, q[-1]))
+            held = np.clip(actions, -1, 1) * envs.torque_limits
+            torques.append(np.where(running[:, None], held, 0.0)[:, None])
+        running &= ~(terminated | truncated)
+    return Rollout(returns, np.stack(q, axis=1), np.concatenate(torques, axis=1))
 
 
 def joint_index(mechanism: Mechanism) -> NDArray[np.intp]:
@@ -138,20 +134,20 @@ def joint_index(mechanism: Mechanism) -> NDArray[np.intp]:
     return np.array([row.index("1") for row in mechanism.forces.values()])
 
 
-def measure(env: LocomotionEnv, episodes: Rollout) -> dict[str, Array]:
-    """Numbers (N,) of each episode.
+def measure(envs: LocomotionVectorEnv, episodes: Rollout) -> dict[str, Array]:
+    """Numbers (N,) of each episode, recorded in environments like these.
 
     distance_m is along the mechanism's forward direction; energy_j is ∫ Σ_a |u_a q̇_a| dt, so that no
     motor gives energy back (exact over a hold, unless the joint turns round in it); cost_of_transport is
     the energy over weight times distance.
     """
-    mechanism = env.mechanism
-    forward = np.sign(value_of(mechanism.forward, env.params))
+    mechanism, params = envs.mechanism, envs.params
+    forward = np.sign(value_of(mechanism.forward, params))
     x = mechanism.coordinates.index(mechanism.fibre[0])
     distance = forward * (episodes.q[:, -1, x] - episodes.q[:, 0, x])
     turned = np.diff(episodes.q[:, :, joint_index(mechanism)], axis=1)
     energy = np.abs(episodes.torques * turned).sum(axis=(1, 2))
-    at_origin = env.params | dict.fromkeys(mechanism.coordinates, 0.0)
+    at_origin = params | dict.fromkeys(mechanism.coordinates, 0.0)
     weight = GRAVITY * mechanism.numeric(mechanism.inertia, at_origin)[x, x]
     with np.errstate(divide="ignore", invalid="ignore"):
         cost = energy / (weight * distance)
@@ -162,9 +158,9 @@ def evaluate(
     controller: Controller, env_id: str, config: EvaluationConfig, **options: Any
 ) -> tuple[Rollout, dict[str, Array]]:
     """Episodes of a controller from the starts that are kept for judging, and the numbers of each."""
-    envs = make_envs(env_id, config.episodes, **options)
+    envs = make_envs(env_id, config.episodes, whole_state=True, **options)
     episodes = rollout(controller, envs, range(EVALUATION_SEEDS, EVALUATION_SEEDS + config.episodes))
-    return episodes, measure(locomotion(envs[0]), episodes)
+    return episodes, measure(envs, episodes)
 
 
 def summary(values: Array) -> dict[str, float]:
@@ -182,6 +178,19 @@ def load_policy(path: Path) -> PolicyController:
     from stable_baselines3 import PPO
 
     return PolicyController(PPO.load(path, device="cpu"))
+
+
+def _raise_failure(
+    infos: Mapping[str, Any], running: NDArray[np.bool_], seeds: Sequence[int], actions: NDArray[np.float32]
+) -> None:
+    """Raise what a single environment would, for the first of the episodes that are not over."""
+    for key, error, what in (
+        ("bad_action", ValueError, "was given actions that are not numbers,"),
+        ("diverged", FloatingPointError, "diverged after actions"),
+    ):
+        failed = np.flatnonzero(running & infos.get(key, False))
+        if len(failed):
+            raise error(f"the episode with seed {seeds[failed[0]]} {what} {actions[failed[0]]}")
 
 
 @dataclass(frozen=True)

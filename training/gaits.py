@@ -23,8 +23,9 @@ from scipy.optimize import Bounds, differential_evolution
 from mechanics.expressions import evaluate
 from mechanics.model import Model
 from nhenv.env import LocomotionEnv
+from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, GaitConfig
-from training.evaluate import joint_index, locomotion, make_envs, rollout
+from training.evaluate import joint_index, make_envs, rollout
 from training.progress import Report, ignore
 from training.store import piece_path, settings, source_digest, versions, write_json
 
@@ -50,7 +51,7 @@ class Joints:
         dt: control period in s.
     """
 
-    def __init__(self, env: LocomotionEnv) -> None:
+    def __init__(self, env: LocomotionEnv | LocomotionVectorEnv) -> None:
         mechanism, names = env.mechanism, env.mechanism.coordinates
         self.model = Model(mechanism, env.params)
         self.limits, self.dt = env.torque_limits, env.dt
@@ -213,11 +214,15 @@ def bounds(joints: Joints, config: GaitConfig) -> Bounds:
     return Bounds(*np.transpose(ranges))
 
 
-def sinusoid(env: gym.Env[Any, Any], config: GaitConfig, vector: ArrayLike) -> Sinusoid:
-    """Controller for the gait (p,), or for one gait an episode (N, p)."""
-    joints = Joints(locomotion(env))
+def sinusoid(env: gym.Env[Any, Any] | LocomotionVectorEnv, config: GaitConfig, vector: ArrayLike) -> Sinusoid:
+    """Controller for the gait (p,), or for one gait an episode (N, p), made for episodes as long as those of the id."""
+    inner, spec = env.unwrapped, env.spec
+    assert isinstance(inner, LocomotionEnv | LocomotionVectorEnv)
+    assert spec is not None
+    assert spec.max_episode_steps is not None
+    joints = Joints(inner)
     ratio = np.where(joints.cyclic, config.cyclic_ratio, 1.0)
-    duration = env.get_wrapper_attr("_max_episode_steps") * joints.dt
+    duration = spec.max_episode_steps * joints.dt
     return Sinusoid(joints, Gait.from_vector(np.asarray(vector, dtype=float), ratio, duration))
 
 
@@ -229,8 +234,7 @@ def tune(env_id: str, config: GaitConfig, report: Report = ignore) -> Tuned:
         config: settings of the search.
         report: hears of every generation.
     """
-    envs = make_envs(env_id, config.population * config.starts)
-    ranges = bounds(Joints(locomotion(envs[0])), config)
+    ranges = bounds(Joints(make_envs(env_id, 1)), config)
     history: list[float] = []
     episodes = 0
 
@@ -238,9 +242,10 @@ def tune(env_id: str, config: GaitConfig, report: Report = ignore) -> Tuned:
         """Negative mean returns (S,) of gaits (p, S)."""
         nonlocal episodes
         count = candidates.shape[1]
-        controller = sinusoid(envs[0], config, np.repeat(candidates.T, config.starts, axis=0))
         seeds = [TUNING_SEEDS + start for start in range(config.starts)] * count
-        outcome = rollout(controller, envs[: len(seeds)], seeds, record=False)
+        envs = make_envs(env_id, len(seeds))
+        controller = sinusoid(envs, config, np.repeat(candidates.T, config.starts, axis=0))
+        outcome = rollout(controller, envs, seeds, record=False)
         means = outcome.returns.reshape(count, config.starts).mean(axis=1)
         episodes += len(seeds)
         history.append(float(max([*history[-1:], means.max()])))

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nhenv.env import LocomotionEnv
+from nhenv.vector_env import LocomotionVectorEnv
 from training.evaluate import Rollout, joint_index
 from training.store import write_bytes
 
@@ -44,7 +44,7 @@ class Shown:
 def draw(
     path: Path,
     title: str,
-    env: LocomotionEnv,
+    envs: LocomotionVectorEnv,
     shown: Sequence[Shown],
     curves: Mapping[str, Sequence[Mapping[str, Any]]],
     reached: Mapping[str, float],
@@ -54,23 +54,23 @@ def draw(
     Args:
         path: file.
         title: heading.
-        env: environment of the episodes.
+        envs: environments of the episodes.
         shown: controllers; the joints of the first and the last are drawn side by side.
         curves: label -> learning curve of a seed.
         reached: gait -> its distance in m.
     """
-    height = _height_of_paths(env, shown)
+    height = _height_of_paths(envs, shown)
     figure = Figure(figsize=(9, 7.7 + height), dpi=150, layout="constrained")
     figure.suptitle(title, fontweight="bold")
     axes = figure.subplot_mosaic(
         [["path", "path"], ["curve", "curve"], ["angle0", "angle1"], ["torque0", "torque1"]],
         height_ratios=[height, 2.3, 1.8, 1.8],
     )
-    _paths(axes["path"], env, shown)
+    _paths(axes["path"], envs, shown)
     _curves(axes["curve"], curves, reached)
     for i, one in enumerate((shown[0], shown[-1])):
-        _angles(axes[f"angle{i}"], env, one)
-        _torques(axes[f"torque{i}"], env, one)
+        _angles(axes[f"angle{i}"], envs, one)
+        _torques(axes[f"torque{i}"], envs, one)
     for name in ("angle", "torque"):
         pair = [axes[f"{name}{i}"] for i in range(2)]
         low, high = zip(*(ax.get_ylim() for ax in pair), strict=True)
@@ -84,15 +84,15 @@ def draw(
     write_bytes(path, content.getvalue())
 
 
-def _height_of_paths(env: LocomotionEnv, shown: Sequence[Shown]) -> float:
+def _height_of_paths(envs: LocomotionVectorEnv, shown: Sequence[Shown]) -> float:
     """Height in inches at which the paths fill the width of the figure, and a line of legend fits."""
-    x, y, _ = (env.mechanism.coordinates.index(name) for name in env.mechanism.fibre)
+    x, y, _ = (envs.mechanism.coordinates.index(name) for name in envs.mechanism.fibre)
     wide, high = (np.ptp([one.episodes.q[0][:, i] for one in shown]) for i in (x, y))
     return float(np.clip(9 * high / max(wide, 1e-9), 0.5, 3.5)) + 0.5
 
 
-def _paths(ax: Axes, env: LocomotionEnv, shown: Sequence[Shown]) -> None:
-    x, y, _ = (env.mechanism.coordinates.index(name) for name in env.mechanism.fibre)
+def _paths(ax: Axes, envs: LocomotionVectorEnv, shown: Sequence[Shown]) -> None:
+    x, y, _ = (envs.mechanism.coordinates.index(name) for name in envs.mechanism.fibre)
     for one in shown:
         q = one.episodes.q[0]
         ax.plot(q[:, x], q[:, y], color=one.color, label=one.label, lw=1.2)
@@ -113,21 +113,21 @@ def _curves(ax: Axes, curves: Mapping[str, Sequence[Mapping[str, Any]]], reached
     ax.legend(loc="lower right", frameon=False)
 
 
-def _angles(ax: Axes, env: LocomotionEnv, one: Shown) -> None:
-    time, last = _window(env, one)
-    for i, joint in enumerate(joint_index(env.mechanism)):
-        name = env.mechanism.coordinates[joint]
+def _angles(ax: Axes, envs: LocomotionVectorEnv, one: Shown) -> None:
+    time, last = _window(envs, one)
+    for i, joint in enumerate(joint_index(envs.mechanism)):
+        name = envs.mechanism.coordinates[joint]
         angle, label = one.episodes.q[0, last, joint], f"${_math(name)}$"
-        if name not in env.mechanism.joint_limits:  # a rotor may also turn steadily, which would dwarf the rest
+        if name not in envs.mechanism.joint_limits:  # a rotor may also turn steadily, which would dwarf the rest
             angle, label = angle - _drift(angle), f"{label}, drift removed"
         ax.plot(time, angle, color=JOINTS[i], ls=STYLES[i], label=label)
     ax.set(ylabel="joint angle (rad)", title=f"{one.label}, last {WINDOW:g} s")
     _legend_above(ax)
 
 
-def _torques(ax: Axes, env: LocomotionEnv, one: Shown) -> None:
-    time, last = _window(env, one)
-    for i, control in enumerate(env.mechanism.controls):
+def _torques(ax: Axes, envs: LocomotionVectorEnv, one: Shown) -> None:
+    time, last = _window(envs, one)
+    for i, control in enumerate(envs.mechanism.controls):
         torque = one.episodes.torques[0, last[:-1], i]
         ax.stairs(torque, time, baseline=None, color=JOINTS[i], ls=STYLES[i], lw=1.3, label=f"${_math(control)}$")
     ax.set(xlabel="time (s)", ylabel="torque (N m)")
@@ -152,7 +152,7 @@ def _drift(values: np.ndarray) -> np.ndarray:
     return np.polynomial.Polynomial.fit(steps, values, 2)(steps)
 
 
-def _window(env: LocomotionEnv, one: Shown) -> tuple[np.ndarray, np.ndarray]:
+def _window(envs: LocomotionVectorEnv, one: Shown) -> tuple[np.ndarray, np.ndarray]:
     steps = one.episodes.torques.shape[1]
-    last = np.arange(max(0, steps - round(WINDOW / env.dt)), steps + 1)
-    return last * env.dt, last
+    last = np.arange(max(0, steps - round(WINDOW / envs.dt)), steps + 1)
+    return last * envs.dt, last

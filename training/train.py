@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -25,43 +24,16 @@ from rich.console import Console
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from nhenv.sb3 import make_sb3_vec_env
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
-from training.evaluate import PolicyController, locomotion, make_envs, measure, rollout
+from training.evaluate import PolicyController, make_envs, measure, rollout
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
 
 __all__ = ["ppo_path", "ppo_settings", "train_piece"]
 
 _CODE = source_digest(__file__)
-
-
-def make_vec_env(env_id: str, n_envs: int) -> VecEnv:
-    """Environments for Stable-Baselines3; the one place that chooses their kind."""
-    return DummyVecEnv([lambda: StaggeredStart(gym.make(check_env_id(env_id)))] * n_envs)
-
-
-class StaggeredStart(gym.Wrapper[Any, Any, Any, Any]):
-    """Truncates the first episode at a random step, so that environments side by side are not in phase."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self._left: int | None = None
-
-    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
-        """Reset; the first time, draw when to truncate."""
-        result = self.env.reset(**arguments)
-        if self._left is None:
-            self._left = int(self.np_random.integers(1, self.get_wrapper_attr("_max_episode_steps"), endpoint=True))
-        return result
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and truncate when it is time."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        assert self._left is not None
-        self._left -= 1
-        return observation, reward, terminated, truncated or self._left == 0, info
 
 
 @dataclass(frozen=True)
@@ -89,7 +61,7 @@ class Run(BaseCallback):
         super().__init__()
         self.config, self.checkpoint, self.report = config, checkpoint, report
         self.curve: list[dict[str, float]] = []
-        self._envs = make_envs(env_id, config.curve_episodes)
+        self._envs = make_envs(env_id, config.curve_episodes, whole_state=True)
         self._before = {"wall_s": 0.0, "cpu_s": 0.0}  # spent before an interruption
         self._began = _clocks()
 
@@ -117,8 +89,8 @@ class Run(BaseCallback):
     def draw(self) -> None:
         """Add a point to the learning curve."""
         assert isinstance(self.model, PPO)
-        seeds = range(TUNING_SEEDS, TUNING_SEEDS + len(self._envs))
-        numbers = measure(locomotion(self._envs[0]), rollout(PolicyController(self.model), self._envs, seeds))
+        seeds = range(TUNING_SEEDS, TUNING_SEEDS + self._envs.num_envs)
+        numbers = measure(self._envs, rollout(PolicyController(self.model), self._envs, seeds))
         point = {"steps": self.model.num_timesteps, "cpu_s": self.spent["cpu_s"]}
         self.curve.append(point | {name: float(numbers[name].mean()) for name in ("return", "distance_m")})
 
@@ -150,7 +122,7 @@ def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
     """An untrained model."""
     return PPO(
         "MlpPolicy",
-        make_vec_env(env_id, config.n_envs),
+        make_sb3_vec_env(check_env_id(env_id), config.n_envs),
         learning_rate=Linear(*config.learning_rate),
         n_steps=config.n_steps,
         batch_size=config.batch_size,

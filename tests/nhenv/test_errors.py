@@ -62,6 +62,7 @@ ARGUMENTS = {
     "torque limits shape": (RACER, {"torque_limits": [1, 2]}, ValueError, ["torque_limits", "u_psi", "[1, 2]"]),
     "joint limit unknown": (SNAKEBOARD, {"joint_limits": {"psi": 1}}, ValueError, ["'psi'", "known: phi"]),
     "joint limit negative": (SNAKEBOARD, {"joint_limits": {"phi": -1}}, ValueError, ["joint limit of phi", "positive"]),
+    "whole state": (RACER, {"whole_state": 1}, ValueError, ["whole_state", "True or False", "got 1"]),
     "joint limit bare": (RACER, {"joint_limits": 1.0}, ValueError, ["joint_limits", "True, False", "1.0"]),
 }  # fmt: skip
 

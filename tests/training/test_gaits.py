@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from training.config import COMPARED, GaitConfig, for_env
-from training.evaluate import evaluate, locomotion, make_envs, measure, rollout
+from training.evaluate import evaluate, make_envs, measure, rollout
 from training.gaits import Gait, Joints, Sinusoid, bounds, gait_path, sinusoid, tune, tune_piece
 from training.store import read_json
 
@@ -21,7 +21,7 @@ def moving(request):
     env.action_space.seed(3)
     for _ in range(40):
         observation, *_ = env.step(env.action_space.sample())
-    return locomotion(env), observation
+    return env.unwrapped, observation
 
 
 on_the_move = pytest.mark.parametrize("moving", COMPARED, indirect=True)
@@ -53,39 +53,45 @@ def test_computed_torque_gives_the_acceleration_asked_for(moving):
 @pytest.mark.parametrize("last", [lambda m: (), lambda m: (np.full(m, 0.3), [1.0], [0.0])])
 @every_environment
 def test_weak_gait_follows_its_reference(env_id, last):
-    envs = make_envs(env_id, 3)
-    env = locomotion(envs[0])
-    joints = Joints(env)
+    envs = make_envs(env_id, 3, whole_state=True)
+    joints = Joints(envs)
     m = len(joints.index)
     vector = np.concatenate([np.full(m, 0.2), np.linspace(0.3, 1.0, m), np.full(m, 20.0), [2.0], *last(m)])
     gait = Gait.from_vector(vector, np.ones(m), 15.0)
     episodes = rollout(Sinusoid(joints, gait), envs, range(3))
     settled = slice(20, None)  # 1 s, many times 1/kd
     assert np.abs(episodes.torques[:, settled]).max(axis=(0, 1)).max() < 0.99 * joints.limits.min()
-    times = np.arange(episodes.q.shape[1]) * env.dt
+    times = np.arange(episodes.q.shape[1]) * envs.dt
     reference = np.array([gait.angle(t) for t in times])
     error = episodes.q[..., joints.index] - reference
     # A rotor's rate is followed, its angle is free: take the offset out.
     error -= np.where(joints.cyclic, error[:, settled].mean(axis=1, keepdims=True), 0.0)
     # Holding the torque over dt leaves an error of the order (w dt)^2 = 1e-2 of the amplitude of 0.2.
-    assert np.abs(error[:, settled]).max() < 0.2 * (2.0 * env.dt) ** 2
+    assert np.abs(error[:, settled]).max() < 0.2 * (2.0 * envs.dt) ** 2
 
 
 @pytest.mark.parametrize(("phase", "direction"), [(0.0, -1), (np.pi, 1)])
 def test_snakeboard_goes_back_in_phase_and_forth_in_antiphase(phase, direction):
     # Ostrowski et al.: the 1:1 gait drives; S(nT) = -2π n κ w a_ψ J1(a_φ) for zero phases.
-    envs = make_envs(SNAKEBOARD, 3)
-    joints = Joints(locomotion(envs[0]))
+    envs = make_envs(SNAKEBOARD, 3, whole_state=True)
+    joints = Joints(envs)
     gait = Gait.from_vector(np.array([1.0, 0.3, phase, 0.0, 15.0, 15.0, 3.0]), np.ones(2), 15.0)
-    distance = measure(locomotion(envs[0]), rollout(Sinusoid(joints, gait), envs, range(3)))["distance_m"]
+    distance = measure(envs, rollout(Sinusoid(joints, gait), envs, range(3)))["distance_m"]
     assert (direction * distance > 1.0).all()
 
 
 def test_cyclic_ratio_multiplies_the_rotor_only():
-    controller = sinusoid(make_envs(SNAKEBOARD, 1)[0], GaitConfig(cyclic_ratio=2.0), np.ones(7))
+    controller = sinusoid(make_envs(SNAKEBOARD, 1), GaitConfig(cyclic_ratio=2.0), np.ones(7))
     rotor, steering = controller.gait.angle(0.7)
     assert rotor == pytest.approx(np.sin(2 * 0.7 + 1))
     assert steering == pytest.approx(np.sin(0.7 + 1))
+
+
+@pytest.mark.parametrize("make", [gym.make, lambda env_id: make_envs(env_id, 2)])
+def test_gait_is_as_long_as_an_episode(make):
+    config = GaitConfig(steered=True)
+    controller = sinusoid(make(SNAKEBOARD), config, np.array([1, 0.2, 0, 0, 9, 9, 4, 0.5, 0.4, 7, 0.1]))
+    np.testing.assert_allclose(controller.gait.frequency_rate, (7 - 4) / 15.0)
 
 
 def test_schedule_arrives_where_it_should():
@@ -101,22 +107,22 @@ def test_schedule_arrives_where_it_should():
 
 
 def test_steering_turns_joints_with_stops_against_the_heading():
-    (board,) = make_envs(SNAKEBOARD, 1)
-    joints = Joints(locomotion(board))
+    board = make_envs(SNAKEBOARD, 1)
+    joints = Joints(board)
     vector = np.array([0.0, 0.0, 0.0, 0.0, 15.0, 15.0, 1.0, 0.0, 0.0, 1.0, -0.4])
     controller = Sinusoid(joints, Gait.from_vector(vector, np.ones(2), 15.0))
     observation, _ = board.reset(options={"q": [0, 0, 0.5, 0, 0]})
     for _ in range(60):  # 3 s, many times 1/kd
-        observation, *_ = board.step(controller(observation[None])[0])
+        observation, *_ = board.step(controller(observation))
     # The rotor rests, so the heading stays and the steering settles where it is asked to be.
-    assert locomotion(board).q[4] == pytest.approx(-0.4 * np.sin(0.5), rel=1e-3)
+    assert board.q[0, 4] == pytest.approx(-0.4 * np.sin(0.5), rel=1e-3)
 
 
 @pytest.mark.parametrize("steered", [False, True])
 @every_environment
 def test_bounds_respect_stops_and_sampling(env_id, steered):
-    env = locomotion(make_envs(env_id, 1)[0])
-    joints, config = Joints(env), GaitConfig(steered=steered)
+    envs = make_envs(env_id, 1)
+    joints, config = Joints(envs), GaitConfig(steered=steered)
     ranges = bounds(joints, config)
     m = len(joints.index)
     low, high = (Gait.from_vector(np.asarray(side), np.ones(m), 1.0) for side in (ranges.lb, ranges.ub))
@@ -126,7 +132,7 @@ def test_bounds_respect_stops_and_sampling(env_id, steered):
     np.testing.assert_array_equal(high.amplitude, np.where(joints.cyclic, config.cyclic_amplitude, joints.stops))
     assert (low.frequency.item(), high.frequency.item()) == config.frequency
     assert (high.amplitude_rate == 0).all()  # the last amplitudes have the same range
-    assert high.damping.max() * env.dt < 2  # beyond it the held feedback overshoots more each time
+    assert high.damping.max() * envs.dt < 2  # beyond it the held feedback overshoots more each time
 
 
 def test_finished_gait_is_not_tuned_again(tmp_path):
@@ -145,6 +151,6 @@ def test_tuning_improves_on_its_start_and_is_reproducible():
     assert heard == [(done, 5) for done in range(1, 6)]
     assert tuned.episodes == 5 * 14  # 16 candidates are rounded down to a multiple of 7 parameters
     assert tune(SNAKEBOARD, TINY) == tuned
-    env = make_envs(SNAKEBOARD, 1)[0]
-    episodes, _ = evaluate(sinusoid(env, TINY, tuned.vector), SNAKEBOARD, for_env(SNAKEBOARD).evaluation)
+    gait = sinusoid(make_envs(SNAKEBOARD, 1), TINY, tuned.vector)
+    episodes, _ = evaluate(gait, SNAKEBOARD, for_env(SNAKEBOARD).evaluation)
     assert episodes.returns.mean() == pytest.approx(tuned.history[-1], rel=0.05)  # starts differ by 0.1 rad

@@ -9,7 +9,7 @@ from training.config import PPOConfig
 from training.evaluate import load_policy
 from training.progress import Interrupted
 from training.store import read_json
-from training.train import Linear, make_model, make_vec_env, ppo_path, train_piece
+from training.train import Linear, make_model, ppo_path, train_piece
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = PPOConfig(
@@ -102,9 +102,8 @@ def test_linear_schedule():
 
 
 def test_first_episodes_end_out_of_phase_and_later_ones_do_not():
-    count = 5
-    envs = make_vec_env(SNAKEBOARD, count)
-    envs.seed(0)
+    count = TINY.n_envs
+    envs = make_model(SNAKEBOARD, TINY, 0).get_env()
     envs.reset()
     ends = [[] for _ in range(count)]
     for step in range(1, 601):
