@@ -221,8 +221,7 @@ class RowsKernel(Generator):
                 "prepare_rows",
                 block,
                 [
-                    *(f"{u} = limit_{u}*w[a_{u}__w + j]" for u in self._control_names),
-                    *(f"w[u_{u}__w + j] = {u}" for u in self._control_names),
+                    *(f"w[u_{u}__w + j] = limit_{u}*w[a_{u}__w + j]" for u in self._control_names),
                     *self._settled(self._states("s", "p")),
                     *(
                         [f"{self._fields('c', self.carried)} = {self._fields('c', self.carried, 'p')}"]
@@ -293,7 +292,8 @@ class RowsKernel(Generator):
         """Lines that put states into the field x, joints settled on the stops that they are pressed against."""
         if not self.joints:
             return [f"{self._states('x')} = {states}"]
-        controls, stops = _listed(self._control_names), _listed(f"stop_{name}" for name in self._joint_names)
+        controls = self._fields("u", self._control_names)
+        stops = _listed(f"stop_{name}" for name in self._joint_names)
         freed = self._fields("free", self._joint_names)
         return [f"{self._states('x')}{freed} = settle_states({states}{controls}{stops}k)"]
 
@@ -318,7 +318,6 @@ class RowsKernel(Generator):
             return [*parts, *self._no_regular_rows()]
         ((_, rate),), (name,) = self.joints, self._joint_names
         controls = self._fields("u", self._control_names)
-        from_field = [f"{u} = w[u_{u}__w + j]" for u in self._control_names]
         old = _listed(f"{state.name}__old" for state in self.flow.states)
         free = f"free_{name}"
         settle = f"{old}{free}, = settle_states({self._states('s', 'p')}{controls}stop_{name}, k)"
@@ -360,7 +359,6 @@ class RowsKernel(Generator):
                 "rewind_rows",
                 block,
                 [
-                    *from_field,
                     *self._settled(self._states("s", "p")),
                     *self._carry(),
                     f"w[time__w + j] = {self._share('w[trial__w + j]')}",
@@ -402,7 +400,6 @@ class RowsKernel(Generator):
                 "land_rows",
                 block,
                 [
-                    *from_field,
                     f"angle, rate = w[x_{name}__w + j], w[x_{rate.name}__w + j]",
                     "missed = w[missed__w + j] != 0.0",
                     f"w[x_{name}__w + j], w[x_{rate.name}__w + j] = copysign(stop_{name}, angle), 0.0",
@@ -477,12 +474,12 @@ class RowsKernel(Generator):
         for j, (angle, rate) in enumerate(self.joints):
             a, v = angle.name, rate.name
             lines += [
-                f"at = fabs({a}) >= _stop_{a}",
-                f"{a} = copysign(_stop_{a}, {a}) if at else {a}",
-                f"pressed = at & ({v}*{a} >= 0.0)",
-                f"{v} = 0.0 if pressed else {v}",
-                f"push = move_joints({_listed(states)}{_listed(self._control_names)}_k)[{len(self.joints) + j}]",
-                f"_free_{a} = 0.0 if pressed & (push*{a} >= 0.0) else 1.0",
+                f"_at = fabs({a}) >= _stop_{a}",
+                f"{a} = copysign(_stop_{a}, {a}) if _at else {a}",
+                f"_pressed = _at & ({v}*{a} >= 0.0)",
+                f"{v} = 0.0 if _pressed else {v}",
+                f"_push = move_joints({_listed(states)}{_listed(self._control_names)}_k)[{len(self.joints) + j}]",
+                f"_free_{a} = 0.0 if _pressed & (_push*{a} >= 0.0) else 1.0",
             ]
         frees = _listed(f"_free_{name}" for name in self._joint_names)
         lines.append(f"return ({_listed(states)}{frees})")
