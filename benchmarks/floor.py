@@ -80,16 +80,18 @@ class Part:
     Attributes:
         name: of its function in `nhenv.rows`.
         passes: how often it is run in a step.
-        loop: one pass, through as many rows as a register has lanes.
+        streams: registers of rows that a pass goes through.
+        loop: one pass.
     """
 
     name: str
     passes: int
+    streams: int
     loop: Loop
 
     def floor(self, rate: float) -> float:
         """Least seconds a row, at `fma_rate` of the same width."""
-        return self.passes * self.loop.arithmetic / rate
+        return self.passes * self.loop.arithmetic / (self.streams * rate)
 
 
 def loops(*assemblies: str) -> list[Loop]:
@@ -249,6 +251,6 @@ def _compiled_parts(env_id: str, options: dict[str, Any], size: int, cache: str)
     for name in PARTS:
         function = kernel.get(name)  # `screen_rows` is there only if there are stops
         found = loops(*function.inspect_asm().values()) if function else []
-        passes = kernel["SUBSTEPS"] if name == "advance_rows" else 1
-        parts += [Part(name, passes, loop) for loop in found[:1]]
+        passes, streams = (kernel["SUBSTEPS"], kernel["STREAMS"]) if name == "advance_rows" else (1, 1)
+        parts += [Part(name, passes, streams, loop) for loop in found[:1]]
     return parts

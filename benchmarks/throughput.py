@@ -250,7 +250,7 @@ def _floor(results: Results, chosen: Mapping[Ours, Contender]) -> Table:
     rates = ", ".join(f"{dtype} {rate / 1e9:.0f}" for dtype, rate in results.rates.items())
     caption = f"instructions a pass, of {rates} · 10⁹ fused multiply-adds/s; impacts and resets not counted"
     kinds = ("fused", "multiply", "add", "divide", "root", "round", "gather", "other")
-    table = Table("", "passes", "lanes", *kinds, "moved B", "spilled B", "floor ns/env", "share", caption=caption)
+    table = Table("", "passes", "rows", *kinds, "moved B", "spilled B", "floor ns/env", "share", caption=caption)
     for row, parts in results.parts.items():
         floor = sum(part.floor(results.rates[row.dtype]) for part in parts)
         times = [np.median(s) / size for (size, c), s in results.seconds.items() if c == chosen.get(row)]
@@ -261,7 +261,7 @@ def _floor(results: Results, chosen: Mapping[Ours, Contender]) -> Table:
             counts = [f"{loop.counts.get(kind, 0)}" for kind in kinds]
             own = f"{part.floor(results.rates[row.dtype]) * 1e9:.2f}"
             sizes = [f"{loop.moved}", f"{loop.spilled}", own]
-            table.add_row(f"  {part.name}", f"{part.passes}", f"{loop.lanes}", *counts, *sizes)
+            table.add_row(f"  {part.name}", f"{part.passes}", f"{loop.lanes * part.streams}", *counts, *sizes)
     table.columns[0].no_wrap = True
     return table
 

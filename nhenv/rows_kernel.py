@@ -117,7 +117,8 @@ class RowsKernel(Generator):
         lines = [f"{name} = uint64({STRIDE * i})\n" for name, i in fields.items()]
         lines.append("EIGHT, SIXTEEN = uint64(8), uint64(16)\n")
         plain = {
-            "SUBSTEPS": self.substeps, "JOINTS": len(self.joints), "N_STATES": len(self.flow.states),
+            "SUBSTEPS": self.substeps, "STREAMS": 1 if self.varied else 2, "JOINTS": len(self.joints),
+            "N_STATES": len(self.flow.states),
             "N_CONTROLS": len(self.actions), "N_OBSERVATIONS": len(self.observation),
             "STATE": 0, "STEPS": STRIDE * self.lasting["steps__p"], "OVER": STRIDE * self.lasting["over__p"],
             "DT": self.shared["dt__n"], "MAX_STEPS": self.shared["max_steps__n"], "MODE": self.shared["mode__n"],

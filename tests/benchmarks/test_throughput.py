@@ -239,7 +239,8 @@ def test_instructions_of_innermost_vector_loops_are_counted():
     assert (small.lanes, small.counts) == (8, {"add": 1, "multiply": 1})
     assert not small.double
     # 2 passes of 5 instructions for each of 8 rows at once, each of which does 8 of 1e10 multiply-adds a second.
-    assert Part("name", 2, large).floor(rate=1e10) == pytest.approx(1e-9)
+    assert Part("name", 2, 1, large).floor(rate=1e10) == pytest.approx(1e-9)
+    assert Part("name", 2, 2, large).floor(rate=1e10) == pytest.approx(0.5e-9)
 
 
 @pytest.mark.slow
