@@ -83,7 +83,7 @@ _OPERATORS: dict[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-", ast.Mul
 _STRANGE = re.compile(r"[^A-Za-z0-9_.,+*/()\s-]", re.ASCII)
 # Generated code and SymPy's own call these functions by NumPy's names.
 # What generated functions call besides; their arguments have the names that users chose.
-_CALLED = ("clip", "copysign", "either", "fabs", "fma", "move_joints")
+_CALLED = ("either", "fma")
 _RESERVED = {*FUNCTIONS, *CONSTANTS, *(row[2].__name__ for row in FUNCTIONS.values()), *_CALLED}
 _MADE_OF = f"an expression is made of numbers, names, + - * / ** and {', '.join(FUNCTIONS)}"
 

@@ -470,23 +470,24 @@ class RowsKernel(Generator):
 
     def _settle_states(self) -> str:
         """`mechanics.compiler.stops.settle` without branches: the states settled, and whether each joint is free."""
-        states = [state.name for state in self.flow.states]
+        # Two underscores in the middle: no name of a user's then hides a function that is called here.
+        states = [f"{state.name}__s" for state in self.flow.states]
+        controls = [f"{name}__u" for name in self._control_names]
         lines = []
         for j, (angle, rate) in enumerate(self.joints):
-            a, v = angle.name, rate.name
+            a, v = f"{angle.name}__s", f"{rate.name}__s"
+            stop, free = f"_stop_{angle.name}", f"_free_{angle.name}"
             lines += [
-                f"_at = fabs({a}) >= _stop_{a}",
-                f"{a} = copysign(_stop_{a}, {a}) if _at else {a}",
+                f"_at = fabs({a}) >= {stop}",
+                f"{a} = copysign({stop}, {a}) if _at else {a}",
                 f"_pressed = _at & ({v}*{a} >= 0.0)",
                 f"{v} = 0.0 if _pressed else {v}",
-                f"_push = move_joints({_listed(states)}{_listed(self._control_names)}_k)[{len(self.joints) + j}]",
-                f"_free_{a} = 0.0 if _pressed & (_push*{a} >= 0.0) else 1.0",
+                f"_push = move_joints({_listed(states)}{_listed(controls)}_k)[{len(self.joints) + j}]",
+                f"{free} = 0.0 if _pressed & (_push*{a} >= 0.0) else 1.0",
             ]
         frees = _listed(f"_free_{name}" for name in self._joint_names)
         lines.append(f"return ({_listed(states)}{frees})")
-        arguments = (
-            f"{_listed(states)}{_listed(self._control_names)}{_listed(f'_stop_{n}' for n in self._joint_names)}_k"
-        )
+        arguments = f"{_listed(states)}{_listed(controls)}{_listed(f'_stop_{n}' for n in self._joint_names)}_k"
         body = textwrap.indent("\n".join(lines), "    ")
         return f"{self.backend.inline}def settle_states({arguments}):\n{body}\n"
 

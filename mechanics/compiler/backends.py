@@ -67,7 +67,7 @@ class _Printer(PythonCodePrinter):
         return repr(float(expr))
 
     def _print_Function(self, expr: sp.Function) -> str:
-        name = {"Abs": "fabs"}.get(expr.func.__name__, expr.func.__name__)
+        name = {"Abs": "abs"}.get(expr.func.__name__, expr.func.__name__)
         return f"{name}({', '.join(self._print(argument) for argument in expr.args)})"
 
     _print_Abs = _print_sign = _print_Function
