@@ -17,6 +17,7 @@ from typing import Any
 from numpy import empty, int64, uint64
 
 from mechanics.compiler.stops import hold
+from nhenv.scene import DIVERGED, RUNNING, TERMINATED
 
 __all__ = ["SOURCES", "STOPS", "begin_rows", "look_rows", "step_rows"]
 
@@ -24,11 +25,10 @@ Array = Any  # NumPy array, or Numba's view of one
 Count = Any  # whole number, Python's or NumPy's
 
 ROWS = STRIDE = SUBSTEPS = JOINTS = 0
-RUNNING, DIVERGED, TERMINATED = 0.0, 2.0, 4.0
 NEXT_STEP, SAME_STEP, DISABLED = 0.0, 1.0, 2.0
 # Places of the first row: of fields that last, of scratch fields, and of the numbers that hold for all rows.
 STATE = STEPS = OVER = 0
-X = CONTROL = ACTION = BAD = HIT = OBSERVED = REWARD = STATUS = 0
+X = CONTROL = BAD = HIT = STATUS = 0
 N_STATES = N_CONTROLS = N_OBSERVATIONS = 0
 DT = MAX_STEPS = MODE = NOTHING = 0
 

@@ -126,16 +126,8 @@ class RowsKernel(Generator):
             "NOTHING": len(self.shared) - len(rules),
             "NEXT_STEP": rows.NEXT_STEP, "SAME_STEP": rows.SAME_STEP,
         }  # fmt: skip
-        first = {
-            "X": "x",
-            "CONTROL": "u",
-            "ACTION": "a",
-            "BAD": "bad",
-            "HIT": "hit",
-            "OBSERVED": "o",
-            "REWARD": "reward",
-        }
-        for name, kind in {**first, "STATUS": "status"}.items():
+        first = {"X": "x", "CONTROL": "u", "BAD": "bad", "HIT": "hit", "STATUS": "status"}
+        for name, kind in first.items():
             places = [i for field, i in self.scratch.items() if field.startswith(f"{kind}_")]
             plain[name] = STRIDE * min(places, default=0)
         lines += [f"{name} = {value!r}\n" for name, value in plain.items()]
