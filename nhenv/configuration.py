@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mechanics.compiler.integrators import method
 from mechanics.expressions import evaluate, unknown_name
 from mechanics.model import Model
 from nhenv import tasks
@@ -21,6 +22,9 @@ from nhenv.scene import Scene
 __all__ = ["Configuration"]
 
 Array = NDArray[np.float64]
+
+TOLERANCE = 1e-10
+SMALLEST_TOLERANCE = 1e-13
 
 
 class Configuration:
@@ -50,6 +54,7 @@ class Configuration:
         frame: str | None = None,
         integrator: str = "auto",
         substeps: int | None = None,
+        tolerance: float | None = None,
         reset_noise_scale: float = 0.05,
         backend: str = "numba",
         whole_state: bool = False,
@@ -79,6 +84,7 @@ class Configuration:
             stops=bool(self.joint_limits),
             integrator=integrator,
             substeps=substeps,
+            tolerance=_tolerance(tolerance, integrator),
             backend=backend,
             whole_state=bool(whole_state),
         )
@@ -201,6 +207,23 @@ def _array(what: str, value: Any, shape: tuple[int, ...], mask: NDArray[np.bool_
     if not np.isfinite(array).all():
         raise ValueError(f"{what} must be finite, got {reprlib.repr(array.tolist())}")
     return array
+
+
+def _tolerance(given: float | None, integrator: str) -> float:
+    """The tolerance that a scene takes: without one, methods that are asked for by name step as they are."""
+    if given is None:
+        return TOLERANCE if integrator == "auto" else math.inf
+    number = _positive("tolerance", given)
+    if not SMALLEST_TOLERANCE <= number < 1:
+        raise ValueError(
+            f"tolerance must be at least {SMALLEST_TOLERANCE}, because of roundings, and below 1, got {given!r}"
+        )
+    if integrator != "auto" and method(integrator).stages == 1:
+        raise ValueError(
+            f"tolerance={given!r} needs an estimate of the error, and integrator {integrator!r} has too few stages for "
+            "one; choose another, or tolerance=None"
+        )
+    return number
 
 
 def _number(name: str, value: Any) -> float:

@@ -126,6 +126,9 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         frame: frame in which the equations are integrated; None for the one that computes best.
         integrator: "auto", or a method of `mechanics.compiler.integrators`.
         substeps: steps of the method in a control period; None for the default.
+        tolerance: largest error of a control period, by the method's own estimate: of a state z, tolerance (1 + |z|).
+            Where a step is estimated to be worse it is halved until it is not; where nothing helps, the episode ends
+            with info["diverged"]. None: 1e-10 with integrator "auto", no control with one that is named.
         reset_noise_scale: half-width of the initial angles, in rad.
         backend: "numba", or "numpy" for kernels that are interpreted: nothing is compiled, each step
             takes some fifty times as long, and a debugger can walk through it.
@@ -154,6 +157,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         frame: str | None = None,
         integrator: str = "auto",
         substeps: int | None = None,
+        tolerance: float | None = None,
         reset_noise_scale: float = 0.05,
         backend: str = "numba",
         whole_state: bool = False,
@@ -170,6 +174,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             frame=frame,
             integrator=integrator,
             substeps=substeps,
+            tolerance=tolerance,
             reset_noise_scale=reset_noise_scale,
             backend=backend,
             whole_state=whole_state,

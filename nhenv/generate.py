@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
+from math import inf
 from typing import Any
 
 import sympy as sp
@@ -62,6 +63,8 @@ class Generator:
         self.remembered = [state for state in self.flow.states if initial(state) in judged]
         self.rules = self._rules()
         self.method, self.substeps = self._method()
+        self.controlled = scene.tolerance < inf  # then a flight may turn out not to be right
+        self.events = bool(self.joints) or self.controlled  # so that a hold may take more than one flight
         outputs = {**integrated(self.flow), **observation, **judgement, **ending, **self.motion, **self.rules}
         self.program = Program(outputs, [sp.Symbol(name) for name in scene.parameters], equations.definitions)
 
@@ -130,6 +133,16 @@ class Generator:
             name, substeps = self.scene.integrator, 1
         return method(name), self.scene.substeps or substeps
 
+    def may_release(self, angle: sp.Symbol, rate: sp.Symbol) -> bool:
+        """Whether what presses a joint against its stop can change while the controls are held and the joint rests."""
+        meanings: dict[sp.Symbol, sp.Expr] = {}
+        for symbol, meaning in self.equations.definitions:
+            meanings[symbol] = meaning.xreplace(meanings)
+        resting = {rate: sp.S.Zero}
+        push = self.motion[f"vdot:{angle}"].xreplace(meanings).xreplace(resting)
+        moving = [state for state in push.free_symbols & self.flow.rates.keys() if state != rate]
+        return any(self.flow.rates[state].xreplace(meanings).xreplace(resting) != 0 for state in moving)
+
     # -- text ----------------------------------------------------------------------------------
 
     def tables(self, **more: object) -> str:
@@ -154,7 +167,7 @@ class Generator:
         before = [initial(state) for state in states]
         judged = (*states, *before, *self.actions, *self.targets, *([TERMINATED_NOW] if self.ending else []))
         parts = [
-            program.step_function("advance_states", flow, self.method, substeps, self.held, backend, carried),
+            self.step_function("advance_states", substeps, backend, carried),
             program.function("observe", (*states, *self.targets), self.observation, backend),
             program.function("judge", judged, self.judgement, backend),
         ]
@@ -167,6 +180,14 @@ class Generator:
                 self._clear_joints(backend),
             ]
         return [*parts, *self._start(backend)]
+
+    def step_function(
+        self, name: str, substeps: int, backend: Backend, carried: Mapping[str, sp.Expr] | None = None, streams: int = 1
+    ) -> str:
+        """Source of the flight: see `Program.step_function`."""
+        return self.program.step_function(
+            name, self.flow, self.method, substeps, self.held, backend, carried, streams, self.scene.tolerance
+        )
 
     def _clear_joints(self, backend: Backend) -> str:
         """Whether a free flight met no stop, from both its ends; where that is not sure, the answer is no.
@@ -233,8 +254,8 @@ class Generator:
         """Source of the way through impacts: `mechanics.compiler.stops` over this scene's `advance` and `motion`."""
         constants = "".join(f"{name} = {getattr(stops, name)!r}\n" for name in stops.CONSTANTS)
         places = {state: i for i, state in enumerate(self.flow.states)}
-        constants += f"ANGLES = {tuple(places[angle] for angle, _ in self.joints)}\n"
-        constants += f"RATES = {tuple(places[rate] for _, rate in self.joints)}\n"
+        constants += f"ANGLES = array({[places[angle] for angle, _ in self.joints]}, int64)\n"
+        constants += f"RATES = array({[places[rate] for _, rate in self.joints]}, int64)\n"
         pure = included(stops.PURE, backend.inlined())
         return [constants, *self._array_forms(backend), *pure, *included(stops.SOURCES, backend)]
 
@@ -242,16 +263,17 @@ class Generator:
         """`advance` and `motion` over arrays, for the stops."""
         n, m, joints = len(self.flow.states), len(self.actions), len(self.joints)
         state, control, free = items("state", n), items("control", m), items("free", joints)
+        move = f"{items('out', 2 * joints)}, = move_joints({state}, {control}, k)" if joints else "pass"
+        held = f"{control}, {free}, " if joints else f"{control}, "
         return [
             f"{backend.decorator}def advance(h, state, control, free, k, new):\n"
-            f"{textwrap.indent(self.advance(items('new', n), state, control, free), '    ')}\n",
-            f"{backend.decorator}def motion(state, control, k, out):\n"
-            f"    {items('out', 2 * joints)}, = move_joints({state}, {control}, k)\n",
+            f"{textwrap.indent(self.advance(items('new', n), state, held), '    ')}\n    return right\n",
+            f"{backend.decorator}def motion(state, control, k, out):\n    {move}\n",
         ]
 
-    def advance(self, new: str, state: str, control: str, free: str) -> str:
-        """Lines that advance a state by `h`, through all substeps."""
-        return f"{new}, = advance_states(h, {state}, {control}, {free}, k)"
+    def advance(self, new: str, state: str, held: str) -> str:
+        """Lines that advance a state by `h`, through all substeps, and say whether it is `right`."""
+        return f"{new}, right = advance_states(h, {state}, {held}k)"
 
 
 def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) -> dict[str, sp.Expr]:

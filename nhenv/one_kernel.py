@@ -20,11 +20,11 @@ class OneKernel(Generator):
         """Text of the generated module."""
         self.memory = self._memory()
         parts = [
-            f'"""{self.title("one environment")}"""\n\n{self.backend.header}',
+            f'"""{self.title("one environment")}"""\n\n{self.backend.header}from numpy import array, int64\n',
             self._tables(),
             self.constants(),
             *self.functions(self.backend.inlined(), self.substeps),
-            *(self.stop_functions(self.backend) if self.joints else []),
+            *(self.stop_functions(self.backend) if self.events else []),
             self._begin(),
             self._respond(),
         ]
@@ -123,8 +123,8 @@ class OneKernel(Generator):
             f"dt = memory[{place['dt']}]",
             f"k = memory[{self.memory['k'][0]}:{self.memory['k'][1]}]",
         ]
-        flight = f"{new}= advance_states(dt, {old}{held}k)"
-        lines += self._through_impacts(old, new, controls, flight) if self.joints else [flight]
+        flight = f"{new}right = advance_states(dt, {old}{held}k)"
+        lines += self._from_event_to_event(old, new, controls, flight) if self.events else [flight]
         lines += [
             f"status = {RUNNING}",
             f"if not ({' and '.join(f'fabs({name}__new) < {LARGEST}' for name in states) or 'True'}):",
@@ -155,24 +155,25 @@ class OneKernel(Generator):
         text = textwrap.indent("\n".join(lines), "    ")
         return f"{self._wrapped()}def respond(memory, action):\n{text}\n"
 
-    def _through_impacts(self, old: str, new: str, controls: list[str], flight: str) -> list[str]:
-        """Accept free flight if no joint can have met its stop, else integrate from impact to impact."""
+    def _from_event_to_event(self, old: str, new: str, controls: list[str], flight: str) -> list[str]:
+        """Accept free flight if it is right and no joint can have met its stop, else go from event to event."""
         place = self._places()
         away = [f"fabs({a.name}__old) < memory[{place['stop'] + j}]" for j, (a, _) in enumerate(self.joints)]
         stops = items("memory", len(self.joints), place["stop"])
         parts = ("state", "control", "k", "stop", "free", "work", "hits", "new")
         arrays = ", ".join(f"memory[{start}:{end}]" for start, end in (self.memory[part] for part in parts))
         n = len(self.flow.states)
+        clear = f" and clear_joints(dt, {old}{new}{'1.0, ' * len(self.joints)}{stops}, k)" if self.joints else ""
         return [
-            f"if {' and '.join(away)}:",
+            f"accepted = {' and '.join(away) or 'True'}",
+            f"{new}= {old}",
+            "if accepted:",
             f"    {flight}",
-            f"    accepted = clear_joints(dt, {old}{new}{'1.0, ' * len(self.joints)}{stops}, k)",
-            "else:",
-            f"    {new}= {old}",
-            "    accepted = False",
+            f"    accepted = right{clear}",
             "if not accepted:",
             f"    {items('memory', len(controls), place['control'])}, = {', '.join(controls)},",
-            f"    {items('memory', n, place['new'])}, = {new}",
-            f"    hold(dt, {arrays})",
+            f"    held = hold(dt, {arrays})",
             f"    {new}= {items('memory', n, place['state'])},",
+            "    if not held:",
+            f"        {new}= {'nan, ' * n}",
         ]

@@ -5,8 +5,9 @@ over the rows of a block become vector code. A block has what lasts (`p`: states
 is over); a scratch area as large as the first cache has what a step needs on its way (`w`).
 
 Free flight is integrated for all rows at once. Rows that meet a stop are few, but not rare: they are gathered from all
-blocks into a spare one (`v`, `spare`), where they go from impact to impact together, in the very arithmetic of
-`mechanics.compiler.stops`; what does not fit that scheme is left to its `hold`, row by row.
+blocks into a spare one (`v`, `spare`), where they go through an impact together, in the very arithmetic of
+`mechanics.compiler.stops`. So are, into another, those whose flight is not right, to go on in shorter ones. What does
+not fit these schemes is left to `hold`, row by row.
 
 Every function here is plain Python over arrays and runs compiled or not. Names in the section below are stand-ins for
 what the generated module defines itself.
@@ -14,17 +15,17 @@ what the generated module defines itself.
 
 from typing import Any
 
-from numpy import empty, int64, uint64
+from numpy import empty, int64, nan, uint64, zeros
 
 from mechanics.compiler.stops import hold
 from nhenv.scene import DIVERGED, RUNNING, TERMINATED
 
-__all__ = ["SOURCES", "STOPS", "begin_rows", "look_rows", "step_rows"]
+__all__ = ["EVENTFUL", "SOURCES", "begin_rows", "look_rows", "step_rows"]
 
 Array = Any  # NumPy array, or Numba's view of one
 Count = Any  # whole number, Python's or NumPy's
 
-ROWS = STRIDE = SUBSTEPS = JOINTS = 0
+ROWS = STRIDE = SUBSTEPS = JOINTS = EVENTS = KINDS = 0
 NEXT_STEP, SAME_STEP, DISABLED = 0.0, 1.0, 2.0
 # Places of the first row: of fields that last, of scratch fields, and of the numbers that hold for all rows.
 STATE = STEPS = OVER = 0
@@ -38,13 +39,17 @@ load_rows: Any = None  # (w, count, actions): clip the actions, zero those that 
 prepare_rows: Any = None  # (p, w, count, numbers) -> count: settle joints on stops; how many states that changed
 advance_rows: Any = None  # (p, w, count, numbers): move for the row's own time, once for each substep; observe
 see_rows: Any = None  # (p, w, count, numbers): observe
-screen_rows: Any = None  # (p, w, count, numbers) -> count: which may have met a stop
+screen_rows: Any = None  # (p, w, count, numbers) -> count: which may have met a stop, or are not right
 finish_rows: Any = None  # (p, w, count, numbers) -> count: judge, and keep the state; how many have something to report
 inform_rows: Any = None  # (p, w, count, numbers, judged, start): write what was judged, one by one
 emit_rows: Any = None  # (w, count, observations, rewards): write what the step returns
 take_rows: Any = None  # (p, w, count, rows, spare, v, held): copy rows into the spare block
 give_rows: Any = None  # (v, count, rows, observations, rewards): write what their step returns
 put_rows: Any = None  # (spare, count, rows, blocks): copy them back
+begin_flights: Any = None  # (p, w, count, numbers): all of the hold is before each row
+depart_rows: Any = None  # (p, w, count, numbers): settle joints on stops; the time of the next flight
+arrive_rows: Any = None  # (p, w, count, numbers) -> count: keep the state if it is right; how many are not through
+end_flights: Any = None  # (p, w, count, numbers) -> count: which did not get through like this
 bracket_rows: Any = None  # (p, w, count, numbers) -> count: begin the search for the impact
 rewind_rows: Any = None  # (p, w, count, numbers): go back to the beginning of the flight, for the time to be tried
 refine_rows: Any = None  # (p, w, count, numbers) -> count: a better time; how many need another
@@ -53,11 +58,14 @@ check_rows: Any = None  # (p, w, count, numbers) -> count: which did not fit thi
 # Of single rows.
 start_row: Any = None  # (p, j, streams, row, numbers, given): begin an episode
 look_row: Any = None  # (p, j, numbers, observation): observe
-held_numbers: Any = None  # (p, j, numbers) -> constants, stops
-advance: Any = None  # (h, state, control, free, k, new), as in `mechanics.compiler.stops`
+held_numbers: Any = None  # (p, j, numbers, limits) -> constants; write the stops to `limits`
 
 
 MAX_SWEEPS = 12  # Newton's method from a cubic needs two or three
+MAX_ROUNDS = 16  # more are not worth a place for every row of the block
+
+# What comes of a row's free flight: it may have met a stop; it is not right.
+STOPPED, LATE = 1.0, 2.0
 
 # What is sought in a flight that may have met a stop: where it crosses the stop, where it turns; or one flight is left.
 CROSSING, TURN, LAST = 1.0, 2.0, 3.0
@@ -65,7 +73,19 @@ CROSSING, TURN, LAST = 1.0, 2.0, 3.0
 # What happened in a step, as bits.
 DONE, BAD_ROW, DIVERGED_ROW, RESET = 1, 2, 4, 8
 
-CONSTANTS = ("MAX_SWEEPS", "CROSSING", "TURN", "LAST", "DONE", "BAD_ROW", "DIVERGED_ROW", "RESET")
+CONSTANTS = (
+    "MAX_SWEEPS",
+    "MAX_ROUNDS",
+    "STOPPED",
+    "LATE",
+    "CROSSING",
+    "TURN",
+    "LAST",
+    "DONE",
+    "BAD_ROW",
+    "DIVERGED_ROW",
+    "RESET",
+)
 
 
 def step_rows(
@@ -85,11 +105,11 @@ def step_rows(
     last: int,
 ) -> Count:
     """Step the rows of some blocks, and start the episodes that are due; return what happened, as bits."""
-    w, v, spare = scratch[0], scratch[1], scratch[2]
-    places, own = empty(ROWS, uint64), empty(ROWS + 1, uint64)  # row of each place of the spare block, and of a block
+    w, own = scratch[0], empty(ROWS + 1, uint64)  # and the rows of a block
+    held, places = zeros(2, int64), empty((2, ROWS), uint64)  # of each spare block: its size, the row of each place
     # Plain integers, lest Numba compile everything once more for the constant 0.
-    events, held, size = int64(0), int64(0), len(rewards)
-    for b in range(first, last + 1):  # one round more, for what is left in the spare block
+    events, size = int64(0), len(rewards)
+    for b in range(first, last + 1):  # one round more, for what is left in the spare blocks
         p, start = blocks[min(b, last - 1)], b * ROWS
         count = min(ROWS, size - start) if b < last else int64(0)
         end, hits = start + count, int64(0)
@@ -100,14 +120,17 @@ def step_rows(
             for _ in range(SUBSTEPS):
                 advance_rows(p, w, count, numbers)
             hits = screen_rows(p, w, count, numbers)
-        if held > 0 and (held + hits > ROWS or b == last):
-            events |= through_impacts(
-                blocks, streams, spare, v, held, places, numbers, observations, rewards, terminated, truncated, finals,
-                judged, flags,
-            )  # fmt: skip
-            held = int64(0)
-        if hits > 0:
-            held = gather_rows(p, w, count, start, spare, v, held, places, own)
+        for kind in range(KINDS):
+            v, spare = scratch[1 + 2 * kind], scratch[2 + 2 * kind]
+            if held[kind] > 0 and (held[kind] + hits > ROWS or b == last):
+                events |= from_event_to_event(
+                    blocks, streams, spare, v, held[kind], kind == 1, places[kind], numbers, observations, rewards,
+                    terminated, truncated, finals, judged, flags,
+                )  # fmt: skip
+                held[kind] = 0
+            if hits > 0:
+                event = LATE if kind == 1 else STOPPED
+                held[kind] = gather_rows(p, w, count, event, start, spare, v, held[kind], places[kind], own)
         if count > 0:
             busy = finish_rows(p, w, count, numbers)
             emit_rows(w, count, observations[start:end], rewards[start:end])
@@ -123,25 +146,35 @@ def step_rows(
 
 
 def gather_rows(
-    p: Array, w: Array, count: Count, start: Count, spare: Array, v: Array, held: Count, places: Array, own: Array
+    p: Array,
+    w: Array,
+    count: Count,
+    event: float,
+    start: Count,
+    spare: Array,
+    v: Array,
+    held: Count,
+    places: Array,
+    own: Array,
 ) -> Count:
-    """Append the rows that may have met a stop to the spare block, with their state as if there were none."""
+    """Append the rows of an event to the spare block that it has, with their state as if there were none."""
     found = int64(0)
     for j in range(count):  # without a branch, which would be predicted wrongly for most of them
         own[found] = j
-        found += 1 if w[HIT + j] != 0.0 else 0
+        found += 1 if w[HIT + j] == event else 0
     take_rows(p, w, found, own, spare, v, held)
     for i in range(found):
         places[held + i] = uint64(start) + own[i]
     return held + found
 
 
-def through_impacts(
+def from_event_to_event(
     blocks: Array,
     streams: Array,
     spare: Array,
     v: Array,
     count: Count,
+    late: bool,
     places: Array,
     numbers: Array,
     observations: Array,
@@ -152,9 +185,18 @@ def through_impacts(
     judged: Array,
     flags: Array,
 ) -> Count:
-    """Do again the step of the rows in the spare block, through their impacts, and put them back."""
+    """Do again the step of the rows in the spare block, from event to event, and put them back."""
     irregular = count
-    if JOINTS == 1:
+    if KINDS == 2 and late:
+        begin_flights(spare, v, count, numbers)
+        for _ in range(MAX_ROUNDS):
+            depart_rows(spare, v, count, numbers)
+            for _ in range(SUBSTEPS):
+                advance_rows(spare, v, count, numbers)
+            if arrive_rows(spare, v, count, numbers) == 0:
+                break
+        irregular = end_flights(spare, v, count, numbers)
+    elif JOINTS == 1:
         if bracket_rows(spare, v, count, numbers) > 0:
             for _ in range(MAX_SWEEPS):
                 rewind_rows(spare, v, count, numbers)
@@ -168,22 +210,18 @@ def through_impacts(
         irregular = check_rows(spare, v, count, numbers)
     if irregular > 0:
         state, control, new = empty(N_STATES), empty(N_CONTROLS), empty(N_STATES)
-        free, work, hits = empty(JOINTS), empty(2 * JOINTS), empty(JOINTS)
+        limits, free, work, hits = empty(JOINTS), empty(JOINTS), empty(2 * JOINTS), empty(JOINTS)
         for j in range(count):
-            if JOINTS > 1 or v[HIT + j] != 0.0:
+            if v[HIT + j] != 0.0:
                 for i in range(N_STATES):
                     state[i] = spare[STATE + i * STRIDE + j]
-                    new[i] = v[X + i * STRIDE + j]
                 for i in range(N_CONTROLS):
                     control[i] = v[CONTROL + i * STRIDE + j]
-                k, limits = held_numbers(spare, j, numbers)
-                for i in range(JOINTS):
-                    free[i] = 1.0
-                # `new` is only of use to `hold` if it is the state after the whole flight.
-                advance(numbers[DT], state, control, free, k, new)
-                hold(numbers[DT], state, control, k, limits, free, work, hits, new)
+                k = held_numbers(spare, j, numbers, limits)
+                held = hold(numbers[DT], state, control, k, limits, free, work, hits, new)
                 for i in range(N_STATES):
-                    v[X + i * STRIDE + j] = state[i]
+                    v[X + i * STRIDE + j] = state[i] if held else nan
+    if irregular > 0 or late:
         see_rows(spare, v, count, numbers)
     for j in range(count):
         v[HIT + j] = 0.0
@@ -221,7 +259,7 @@ def end_episodes(
     """Report the episodes of a block that are over and start those that are due, as the mode of autoreset says."""
     events = 0
     for j in range(count):
-        if JOINTS > 0 and w[HIT + j] != 0.0:
+        if EVENTS and w[HIT + j] != 0.0:
             continue  # its step is not done yet
         row = rows[j]
         if p[OVER + j] != 0.0 and numbers[MODE] == NEXT_STEP:
@@ -265,5 +303,5 @@ def look_rows(blocks: Array, numbers: Array, observations: Array) -> None:
 
 
 # In the order in which a module that contains them defines them.
-STOPS = (gather_rows, through_impacts)
-SOURCES = (end_episodes, *STOPS, step_rows, begin_rows, look_rows)
+EVENTFUL = (gather_rows, from_event_to_event)
+SOURCES = (end_episodes, *EVENTFUL, step_rows, begin_rows, look_rows)

@@ -58,8 +58,10 @@ class RowsKernel(Generator):
             "reward": [""],
             "status": [""],
         }
-        search = ("hit", "search", "missed", "trial", "low", "high", "end", "side", "gap", "toward")
-        self.scratch = _places({**motion, **judged, **{name: [""] for name in search if angles}}, "w")
+        search = ("search", "missed", "trial", "low", "high", "end", "side", "gap", "toward")
+        kept = ["right", "left", "longest"] * self.controlled + ["hit"] * self.events + [*search] * bool(angles)
+        departure = {"y": states} if self.controlled else {}
+        self.scratch = _places({**motion, **judged, **departure, **{name: [""] for name in kept}}, "w")
         shared = {**({} if varied else own), **{name: [""] for name in ("dt", "noise", "max_steps", "mode")}}
         shared["nothing"] = rules
         self.shared = _places(shared, "n")
@@ -69,13 +71,13 @@ class RowsKernel(Generator):
         strict, inline = self.backend, self.backend.inlined()
         kind = "many environments, each with parameters of its own" if self.varied else "many environments"
         parts = [
-            f'"""{self.title(kind)}"""\n\n{strict.header}{random_streams.IMPORTS}from numpy import empty, int64\n',
+            f'"""{self.title(kind)}"""\n\n{strict.header}{random_streams.IMPORTS}{_IMPORTS}',
             self._tables(),
             self.constants(),
             *self.functions(inline, 1, self.carried),
             *([] if self.varied else [self._twice(inline)]),
             self.program.carry_function("carry", self.flow, self.carried, inline),
-            *(self.stop_functions(strict) if self.joints else []),
+            *(self.stop_functions(strict) if self.events else []),
             *self._constants(),
             *included(random_streams.SOURCES, inline),
             *self._loops(),
@@ -87,15 +89,14 @@ class RowsKernel(Generator):
 
     def _twice(self, backend: Backend) -> str:
         """Source of `advance_states_twice`, which advances two rows in turn, operation by operation."""
-        return self.program.step_function(
-            "advance_states_twice", self.flow, self.method, 1, self.held, backend, self.carried, streams=2
-        )
+        return self.step_function("advance_states_twice", 1, backend, self.carried, streams=2)
 
-    def advance(self, new: str, state: str, control: str, free: str) -> str:
-        """Lines that advance a state by `h`, through all substeps."""
+    def advance(self, new: str, state: str, held: str) -> str:
+        """Lines that advance a state by `h`, through all substeps, and say whether it is `right`."""
         carried = f"*carry({new}, k), " if self.carried else ""
-        step = f"{new}, = advance_states(h, {new}, {carried}{control}, {free}, k)"
-        return f"{new}, = {state},\nh = {self._share('h')}\nfor _ in range({self.substeps}):\n    {step}"
+        step = f"{new}, each = advance_states(h, {new}, {carried}{held}k)\n    right = right & each"
+        start = f"right = True\n{new}, = {state},\nh = {self._share('h')}\n"
+        return f"{start}for _ in range({self.substeps}):\n    {step}"
 
     # -- names ---------------------------------------------------------------------------------
 
@@ -117,7 +118,8 @@ class RowsKernel(Generator):
         lines = [f"{name} = uint64({STRIDE * i})\n" for name, i in fields.items()]
         lines.append("EIGHT, SIXTEEN = uint64(8), uint64(16)\n")
         plain = {
-            "SUBSTEPS": self.substeps, "STREAMS": 1 if self.varied else 2, "JOINTS": len(self.joints),
+            "SUBSTEPS": self.substeps, "JOINTS": len(self.joints),
+            "EVENTS": int(self.events), "KINDS": 2 if self.controlled else 1,
             "N_STATES": len(self.flow.states),
             "N_CONTROLS": len(self.actions), "N_OBSERVATIONS": len(self.observation),
             "STATE": 0, "STEPS": STRIDE * self.lasting["steps__p"], "OVER": STRIDE * self.lasting["over__p"],
@@ -221,13 +223,14 @@ class RowsKernel(Generator):
                         * bool(self.carried)
                     ),
                     f"w[time__w + j] = {self._share('dt')}",
+                    *self._trusted(),
                     f"count_changed += 1 if {' | '.join(changed) or 'False'} else 0",
                 ],
                 "count_changed",
             ),
             self._advance_rows(block),
             self._loop("see_rows", block, self._seen(self._states("x"))),
-            *(self._stop_loops() if self.joints else []),
+            *(self._event_loops() if self.events else []),
             self._finish(block),
             self._inform(),
             self._loop(
@@ -264,17 +267,21 @@ class RowsKernel(Generator):
         """
         states = [state.name for state in self.flow.states]
         new = [_listed(f"{name}__{i}" for name in states) for i in (0, 1)]
+        right = [f"{given}right__{i}, " for i, given in enumerate(new)]
         old = (
             f"w[time__w + j], {self._states('x')}{self._fields('c', self.carried)}"
             f"{self._fields('u', self._control_names)}{self._fields('free', self._joint_names)}"
         )
         outcome = [[f"{self._states('x')} = {each}", *self._seen(each)] for each in new]
+        if self.controlled:
+            for i, lines in enumerate(outcome):
+                lines.append(f"w[right__w + j] = w[right__w + j] if right__{i} else 0.0")
         if self.varied:
-            return self._loop("advance_rows", block, [f"{new[0]} = advance_states({old}k)", *outcome[0]])
+            return self._loop("advance_rows", block, [f"{right[0]} = advance_states({old}k)", *outcome[0]])
         body = [
             "j = pair*SIXTEEN + i",
             "jj = j + EIGHT",
-            f"{new[0]}{new[1]} = advance_states_twice({old}{old.replace('+ j]', '+ jj]')}k)",
+            f"{right[0]}{right[1]} = advance_states_twice({old}{old.replace('+ j]', '+ jj]')}k)",
             *outcome[0],
             *(line.replace("+ j]", "+ jj]") for line in outcome[1]),
         ]
@@ -290,24 +297,87 @@ class RowsKernel(Generator):
         freed = self._fields("free", self._joint_names)
         return [f"{self._states('x')}{freed} = settle_states({states}{controls}{stops}k)"]
 
-    def _stop_loops(self) -> list[str]:
-        """Loops of the way through impacts; those of a single joint follow `mechanics.compiler.stops.hold` closely."""
-        block = "p, w, count, numbers"
+    def _trusted(self) -> list[str]:
+        """Lines that take a flight for right until it turns out not to be."""
+        return ["w[right__w + j] = 1.0"] * self.controlled
+
+    def _clear(self, old: str, time: str) -> list[str]:
+        """Lines that say whether a flight from `old` to the field x was `clear` of stops, and of releases from them."""
+        if not self.joints:
+            return ["clear = True"]
         stops = _listed(f"stop_{name}" for name in self._joint_names)
-        screen = self._loop(
-            "screen_rows",
-            block,
-            [
-                f"clear = clear_joints(dt, {self._states('s', 'p')}{self._states('x')}"
-                f"{self._fields('free', self._joint_names)}{stops}k)",
-                "hit = (not clear) & (p[over__p + j] == 0.0)",
-                "w[hit__w + j] = 1.0 if hit else 0.0",
-                "hits += 1 if hit else 0",
-            ],
-            "hits",
-        )
-        parts = [self._settle_states(), screen, *self._moves()]
-        if len(self.joints) > 1:
+        new, free = self._states("x"), self._fields("free", self._joint_names)
+        lines = [f"clear = clear_joints({time}, {old}{new}{free}{stops}k)"]
+        if any(self.may_release(*joint) for joint in self.joints):
+            lines.append(f"_push = move_joints({new}{self._fields('u', self._control_names)}k)")
+            for i, name in enumerate(self._joint_names, len(self.joints)):
+                pressed = f"(_push[{i}]*w[x_{name}__w + j] >= 0.0)"
+                lines.append(f"clear = clear & ((w[free_{name}__w + j] != 0.0) | {pressed})")
+        return lines
+
+    def _screen(self, block: str) -> str:
+        """The loop that finds the rows whose free flight is not all there is to their step."""
+        lines = [*self._clear(self._states("s", "p"), "dt"), "event = 0.0 if clear else STOPPED"]
+        if self.controlled:
+            lines.append("event = event if w[right__w + j] != 0.0 else LATE")
+        lines += [
+            "event = event if p[over__p + j] == 0.0 else 0.0",
+            "w[hit__w + j] = event",
+            "hits += 1 if event != 0.0 else 0",
+        ]
+        return self._loop("screen_rows", block, lines, "hits")
+
+    def _flight_loops(self, block: str) -> list[str]:
+        """Loops that take rows through a hold in shorter flights: `mechanics.compiler.stops.hold` without events."""
+        states = [state.name for state in self.flow.states]
+        begin = [
+            f"{self._states('y')} = {self._states('s', 'p')}",
+            "w[left__w + j], w[longest__w + j], w[hit__w + j] = dt, dt, 0.0",
+        ]
+        depart = [
+            *self._settled(self._states("y")),
+            "flying = w[left__w + j] > 0.0",
+            *(f"w[x_{name}__w + j] = w[x_{name}__w + j] if flying else w[y_{name}__w + j]" for name in states),
+            f"{self._states('y')} = {self._states('x')}",
+            *self._carry(),
+            "flight = min(w[longest__w + j], w[left__w + j])",
+            f"w[time__w + j] = {self._share('flight')}",
+            *self._trusted(),
+        ]
+        arrive = [
+            "left = w[left__w + j]",
+            "flight, flying = min(w[longest__w + j], left), left > 0.0",
+            *self._clear(self._states("y"), "flight"),
+            "right = w[right__w + j] != 0.0",
+            "there = flying & right & clear",
+            "lost = flying & ((right & (not clear)) | ((not right) & (0.5*flight < SHORTEST*dt)))",
+            "w[hit__w + j] = STOPPED if lost else w[hit__w + j]",
+            "w[longest__w + j] = 2.0*flight if right else 0.5*flight",
+            "left = left - flight if there else (0.0 if lost else left)",
+            "w[left__w + j] = left",
+            *(f"w[y_{name}__w + j] = w[x_{name}__w + j] if there else w[y_{name}__w + j]" for name in states),
+            "count_flying += 1 if left > 0.0 else 0",
+        ]
+        land = [
+            f"{self._states('x')} = {self._states('y')}",
+            "lost = (w[left__w + j] > 0.0) | (w[hit__w + j] != 0.0)",
+            "w[hit__w + j] = STOPPED if lost else 0.0",
+            "count_lost += 1 if lost else 0",
+        ]
+        return [
+            self._loop("begin_flights", block, begin),
+            self._loop("depart_rows", block, depart),
+            self._loop("arrive_rows", block, arrive, "count_flying"),
+            self._loop("end_flights", block, land, "count_lost"),
+        ]
+
+    def _event_loops(self) -> list[str]:
+        """Loops of the way from event to event; those of a single joint follow `mechanics.compiler.stops` closely."""
+        block = "p, w, count, numbers"
+        parts = [*([self._settle_states()] if self.joints else []), self._screen(block), *self._moves()]
+        if self.controlled:
+            parts += self._flight_loops(block)
+        if len(self.joints) != 1:
             return [*parts, *self._no_regular_rows()]
         ((_, rate),), (name,) = self.joints, self._joint_names
         controls = self._fields("u", self._control_names)
@@ -355,6 +425,7 @@ class RowsKernel(Generator):
                     *self._settled(self._states("s", "p")),
                     *self._carry(),
                     f"w[time__w + j] = {self._share('w[trial__w + j]')}",
+                    *self._trusted(),
                 ],
             ),
             self._loop(
@@ -403,6 +474,7 @@ class RowsKernel(Generator):
                     f"w[free_{name}__w + j] = 1.0 if missed else w[free_{name}__w + j]",
                     *self._carry(),
                     f"w[time__w + j] = {self._share('(dt - w[trial__w + j])')}",
+                    *self._trusted(),
                 ],
             ),
             self._loop(
@@ -410,7 +482,8 @@ class RowsKernel(Generator):
                 block,
                 [
                     f"again = (w[free_{name}__w + j] != 0.0) & (fabs(w[x_{name}__w + j]) > stop_{name})",
-                    "irregular = again | (w[hit__w + j] != 0.0) | (w[search__w + j] != 0.0)",
+                    "irregular = again | (w[hit__w + j] != 0.0) | (w[search__w + j] != 0.0)"
+                    + " | (w[right__w + j] == 0.0)" * self.controlled,
                     "w[hit__w + j] = 1.0 if irregular else 0.0",
                     "count_irregular += 1 if irregular else 0",
                 ],
@@ -421,7 +494,7 @@ class RowsKernel(Generator):
     def _moves(self) -> list[str]:
         """Loops that bring rows into the spare block, and back."""
         kinds = [("x", [state.name for state in self.flow.states]), *((kind, self._control_names) for kind in "ua")]
-        needed = [f"{kind}_{name}__w" for kind, names in kinds for name in names] + ["bad__w"]
+        needed = [f"{kind}_{name}__w" for kind, names in kinds for name in names] + ["bad__w", "hit__w"]
         observed = range(len(self.observation))
         return [
             self._loop(
@@ -454,10 +527,10 @@ class RowsKernel(Generator):
         ]
 
     def _no_regular_rows(self) -> list[str]:
-        """With several joints, every impact is left to `hold`."""
+        """Without a joint, or with several, everything is left to `hold`."""
         block = "p, w, count, numbers"
         counted = [self._loop(f"{name}_rows", block, ["total += 0"], "total") for name in ("bracket", "refine")]
-        counted.append(self._loop("check_rows", block, ["total += 1"], "total"))
+        counted.append(self._loop("check_rows", block, ["w[hit__w + j] = STOPPED", "total += 1"], "total"))
         return [*counted, *(self._loop(f"{name}_rows", block, ["pass"]) for name in ("rewind", "land"))]
 
     def _settle_states(self) -> str:
@@ -565,35 +638,37 @@ class RowsKernel(Generator):
 
     def _held_numbers(self) -> str:
         """What `hold` takes: constants and stops of a row."""
-        stops = _listed(f"stop_{name}" for name in self._joint_names)
-        lines = ["j = uint64(j)", *self._known(), f"return k, ({stops})"]
+        stops = [f"limits[{i}] = stop_{name}" for i, name in enumerate(self._joint_names)]
+        lines = ["j = uint64(j)", *self._known(), *stops, "return k"]
         body = textwrap.indent("\n".join(lines), "    ")
-        return f"{self.backend.decorator}def held_numbers(p, j, numbers):\n{body}\n"
+        return f"{self.backend.decorator}def held_numbers(p, j, numbers, limits):\n{body}\n"
 
     def _driver(self) -> list[str]:
         """What `nhenv.rows` says, for this scene."""
         entry = self.backend.decorator.replace("@njit(", "@njit(nogil=True, cache=CACHE__, ")
         entries = (rows.step_rows, rows.begin_rows, rows.look_rows)
-        parts = [self._held_numbers()] if self.joints else [_NO_STOPS.replace("@", self.backend.inline)]
+        parts = [self._held_numbers()] if self.events else [_NO_EVENTS.replace("@", self.backend.inline)]
         for function in rows.SOURCES:
-            if self.joints or function not in rows.STOPS:
+            if self.events or function not in rows.EVENTFUL:
                 backend = dataclasses.replace(self.backend, decorator=entry) if function in entries else self.backend
                 parts += included([function], backend)
         return parts
 
 
-# A scene without joints has no impacts.
-_NO_STOPS = """@def screen_rows(p, w, count, numbers):
+_IMPORTS = "from numpy import array, empty, int64, nan, zeros\n"
+
+# Without joints, and without a tolerance, free flight is all there is.
+_NO_EVENTS = """@def screen_rows(p, w, count, numbers):
     return 0
 
 
-@def gather_rows(p, w, count, start, spare, v, held, places, own):
+@def gather_rows(p, w, count, event, start, spare, v, held, places, own):
     return held
 
 
-@def through_impacts(
-    blocks, streams, spare, v, count, places, numbers, observations, rewards, terminated, truncated, finals, judged,
-    flags,
+@def from_event_to_event(
+    blocks, streams, spare, v, count, late, places, numbers, observations, rewards, terminated, truncated, finals,
+    judged, flags,
 ):
     return 0
 """

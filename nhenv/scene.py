@@ -12,6 +12,7 @@ episode, the task's targets, has a place in the memory too.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -56,6 +57,8 @@ class Scene:
         stops: whether joint limits act.
         integrator: name of a method, or "auto".
         substeps: steps of the method in a hold; None for the default.
+        tolerance: what no flight may get wrong by the method's own estimate, of a state z in (1 + |z|); a hold is
+            divided into as many flights as that takes. Infinite: whatever the method gives.
         backend: "numba" or "numpy".
         whole_state: whether states are followed that nothing observed, rewarded or reported depends on.
     """
@@ -66,6 +69,7 @@ class Scene:
     stops: bool = True
     integrator: str = "auto"
     substeps: int | None = None
+    tolerance: float = math.inf
     backend: str = "numba"
     whole_state: bool = False
 

@@ -316,7 +316,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         entries: dict[str, Callable[..., int]] = {}  # by the letter of the actions' type
 
         def part(first: int, last: int) -> Callable[..., int]:
-            scratch = np.zeros((3, max(kernel.SCRATCH, kernel.SIZE)))
+            scratch = np.zeros((5, max(kernel.SCRATCH, kernel.SIZE)))
 
             def run(actions: Any, observations: Any, rewards: Any, terminated: Any, truncated: Any) -> int:
                 arguments = (

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from math import inf
 from operator import methodcaller
 
 import sympy as sp
@@ -21,6 +22,9 @@ from mechanics.compiler.integrators import Method
 
 __all__ = ["Program", "integrated", "needed", "operation_count"]
 
+
+# In rad, within a step: beyond this, errors may be aliased, and so escape the estimate.
+LARGEST_TURN = 1.5
 
 # d sin = cos * rate, d cos = -sin * rate
 _QUARTER_TURN: dict[type, tuple[type, str]] = {sp.sin: (sp.cos, ""), sp.cos: (sp.sin, "-")}
@@ -161,8 +165,12 @@ class Program:
         backend: Backend,
         carried: Mapping[str, sp.Expr] | None = None,
         streams: int = 1,
+        tolerance: float = inf,
     ) -> str:
-        """Source of `name(_h, *states, *carried, *held, _k)` -> states after _h seconds.
+        """Source of `name(_h, *states, *carried, *held, _k)` -> states after _h seconds, and whether they are right.
+
+        They are if no substep, by the method's own estimate, makes a state z wrong by more than `tolerance` (1 + |z|),
+        or turns an angle so far that the estimate might be deceived; always, and unchecked, if that is infinite.
 
         With several streams, of one that takes these arguments for one system after the other, and does every
         operation for one after the other: what one waits for, another uses the time of.
@@ -182,41 +190,68 @@ class Program:
         base |= {initial(state): state.name for state in flow.states}
         carried = carried or {}
         base |= {expression: given for given, expression in carried.items()}
-        start, end = _Point("", {**base, TAU: "_h"}), {}
+        start, end, errors = _Point("", {**base, TAU: "_h"}), {}, {}
         stages = [_Stage(self, body, flow, method, i, start) for i in range(method.stages)]
         for stage in stages:
             stage.others = stages
         integrated_states = [state for state in flow.states if state not in flow.solutions]
+        estimated = integrated_states if tolerance < inf else []
+        doubts = method.estimate[0] if estimated else [0.0] * method.stages
         for state in flow.solutions:
             end[state] = body.polynomial(state, "_h", start)
         if method.explicit:
             end |= {state: state.name for state in integrated_states}
-            for stage, weight in zip(stages, method.b, strict=True):
+            for stage, weight, doubt in zip(stages, method.b, doubts, strict=True):
                 for state in integrated_states:
                     rate = stage.rate(state)
                     if weight:  # summed up on the way, lest all rates be kept until the end
                         total = backend.sum_of_products([(repr(weight), rate)], end[state])
                         end[state] = body.assign(f"_e_{state.name}{stage.suffix}", total)
+                    if doubt:
+                        total = backend.sum_of_products([(repr(doubt), rate)], errors.get(state, ""))
+                        errors[state] = body.assign(f"_d_{state.name}{stage.suffix}", total)
         else:  # layer after layer
             for state in integrated_states:
-                end[state] = body.moved(state.name, method.b, stages, methodcaller("rate", state))
+                total = body.moved(state.name, method.b, stages, methodcaller("rate", state))
+                end[state] = body.assign(f"_e_{state.name}", total)
+            for state in estimated:
+                errors[state] = body.moved("", doubts, stages, methodcaller("rate", state))
+        right = ["_right"] * (substeps > 1)
+        if estimated:
+            limit = repr(method.threshold(tolerance))
+            bounds = {s: backend.sum_of_products([(limit, f"fabs({end[s]})")], limit) for s in estimated}
+            right += [f"(fabs({errors[state]}) <= {bound})" for state, bound in bounds.items()]
+            right += [f"(fabs({end[a]} - {a.name}) <= {LARGEST_TURN!r})" for a in self._turning(flow)]
         names = [state.name for state in flow.states]
         arguments = ["_h", *names, *carried, *(symbol.name for symbol in held)]
-        lines, values = body.text(), [end[state] for state in flow.states]
+        names = [*names, "_right"]
+        lines, values = body.text(), [*(end[state] for state in flow.states), " & ".join(right) or "True"]
         if streams > 1:
-            local = _renamer([*arguments, *(line.partition(" = ")[0] for line in lines)])
+            local = _renamer([*arguments, *names, *(line.partition(" = ")[0] for line in lines)])
             lines = [local(line, i) for line in lines for i in range(streams)]
             values = [local(value, i) for i in range(streams) for value in values]
             names, arguments = (
                 [local(name, i) for i in range(streams) for name in group] for group in (names, arguments)
             )
         text = _indent("".join(f"{value},\n" for value in values))
-        lines = [*lines, f"{', '.join(names)}, = (\n{text})"] if names else []
+        lines.append(f"{', '.join(names)}, = (\n{text})")
         if substeps > 1:
             loop = _indent("\n".join(lines))
-            lines = [f"_h = _h*{1 / substeps!r}", f"for _ in range({substeps}):\n{loop}"]
+            lines = ["_right = True", f"_h = _h*{1 / substeps!r}", f"for _ in range({substeps}):\n{loop}"]
         lines = [*self._unpack(body), *lines, f"return ({''.join(f'{n}, ' for n in names)})"]
         return _function(name, [*arguments, "_k"], lines, backend.decorator)
+
+    def _turning(self, flow: Dataflow) -> list[sp.Symbol]:
+        """The states of which a rate takes a sine or cosine."""
+        rates = [self.outputs[f"rate:{state.name}"] for state in flow.rates if state not in flow.solutions]
+        used, wanted = set[sp.Symbol](), {symbol for rate in rates for symbol in rate.free_symbols}
+        while wanted:
+            used |= wanted
+            meanings = [self.temporaries[symbol] for symbol in wanted & self.temporaries.keys()]
+            wanted = {symbol for meaning in meanings for symbol in meaning.free_symbols} - used
+        circles = [self.temporaries[symbol] for symbol in used & self.temporaries.keys()]
+        angles = {symbol for f in circles if f.func in _QUARTER_TURN for symbol in f.args[0].free_symbols}
+        return [state for state in flow.states if state in angles]
 
     def carried(self, flow: Dataflow, method: Method) -> dict[str, sp.Expr]:
         """What a step needs of the state that it begins with and no control takes part in: name -> expression.

@@ -9,17 +9,25 @@ states that depend on one another in layers only; `codegen` needs no more than t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
+from itertools import combinations_with_replacement
+from math import prod
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mechanics.expressions import unknown_name
 
 __all__ = ["Method", "method", "method_names"]
 
+Tree = tuple["Tree", ...]  # a rooted tree: what hangs from its root
+
 # Coefficients are double precision: conditions on them hold to a few roundings of a sum of 15.
 CONDITION_TOLERANCE = 1e-14
+NULL = 1e-10  # singular values of conditions below this, of the largest, are roundings of a zero
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,9 @@ class Method:
         c: [s] nodes, as fractions of the step.
         order: the error of one step of length h is O(h^(order + 1)).
         source: where the coefficients come from.
+        safety: how much larger the error may be than its estimate leads to expect, see `threshold`. Measured on 33,000
+            states that gaits, relays and random actions reach: with these, the error was above the tolerance, by half
+            of it at most, in one of 8000.
     """
 
     name: str
@@ -41,6 +52,7 @@ class Method:
     c: tuple[float, ...]
     order: int
     source: str
+    safety: float = 100.0
 
     def __post_init__(self) -> None:
         if len(self.a) != self.stages or any(len(row) != self.stages for row in self.a) or len(self.c) != self.stages:
@@ -66,6 +78,75 @@ class Method:
     def explicit(self) -> bool:
         """Whether every stage uses earlier stages only."""
         return all(x == 0 for i, row in enumerate(self.a) for x in row[i:])
+
+    @cached_property
+    def estimate(self) -> tuple[tuple[float, ...], int]:
+        """Weights d of an error estimate h sum_i d_i f(Z_i) from the stages that there are, and its order p.
+
+        The combination of all stages that vanishes to the highest order: weights b + d would be another method, of
+        order p. It is the null vector of the conditions of all rooted trees with up to p nodes; sum |d_i| = 1.
+        """
+        for p in range(self.order - 1, 0, -1):
+            conditions = np.array([self._weights(tree) for n in range(1, p + 1) for tree in _trees(n)])
+            conditions /= np.abs(conditions).max(axis=1, keepdims=True) + 1e-300
+            _, values, vectors = np.linalg.svd(conditions)
+            if self.stages > np.sum(values > NULL * values[0]):
+                d = np.where(np.abs(vectors[-1]) > NULL, vectors[-1], 0.0)
+                return tuple((d / np.abs(d).sum()).tolist()), p
+        raise ValueError(f"{self.name} leaves no estimate of its error; choose a method with more stages")
+
+    def threshold(self, tolerance: float) -> float:
+        """Largest estimate with which the error of a step is below `tolerance`.
+
+        Both are sums over the rooted trees of the first order at which they do not vanish, of what the method leaves
+        there times a derivative. If these are all powers of one rate L, the error is C (h L)^(order + 1) and the
+        estimate D (h L)^(p + 1), C and D the norms of what is left: one follows from the other.
+        """
+        d, p = self.estimate
+        left = [self._weights(tree) @ self.b - 1 / _density(tree) for tree in _trees(self.order + 1)]
+        seen = [self._weights(tree) @ d for tree in _trees(p + 1)]
+        reach = (tolerance / self.safety / np.linalg.norm(left)) ** (1 / (self.order + 1))
+        return float(np.linalg.norm(seen) * reach ** (p + 1))
+
+    def _weights(self, tree: Tree) -> NDArray[np.float64]:
+        """(s,) weight of each stage in the order condition of a tree (Butcher)."""
+        known = self._known
+        if tree not in known:
+            known[tree] = np.ones(self.stages)
+            for branch in tree:
+                known[tree] = known[tree] * (np.array(self.a) @ self._weights(branch))
+        return known[tree]
+
+    @cached_property
+    def _known(self) -> dict[Tree, NDArray[np.float64]]:
+        return {}
+
+
+@cache
+def _trees(n: int) -> tuple[Tree, ...]:
+    """The rooted trees with n nodes."""
+    return tuple(_forests(n - 1, n - 1))
+
+
+def _forests(nodes: int, largest: int) -> Iterator[Tree]:
+    """Sets of trees with so many nodes in all, none of more than `largest`."""
+    if nodes == 0:
+        yield ()
+    for size in range(min(nodes, largest), 0, -1):
+        for count in range(1, nodes // size + 1):
+            for rest in _forests(nodes - count * size, size - 1):
+                for trees in combinations_with_replacement(_trees(size), count):
+                    yield trees + rest
+
+
+def _size(tree: Tree) -> int:
+    """Number of nodes."""
+    return 1 + sum(map(_size, tree))
+
+
+def _density(tree: Tree) -> int:
+    """What the sum of a method's weights in the order condition of a tree is to be the inverse of."""
+    return _size(tree) * prod(map(_density, tree))
 
 
 def _rk4() -> Method:
@@ -130,7 +211,7 @@ def _verner9() -> Method:
 
     a = tuple(spread(*rows.get(stage, ((), ()))) for stage in range(1, len(nodes) + 1))
     source = "Verner, Numerically optimal Runge-Kutta pairs with interpolants, 2010: the most efficient 9(8) pair"
-    return Method("verner9", a, spread(*end), nodes, 9, source)
+    return Method("verner9", a, spread(*end), nodes, 9, source, safety=5.0)
 
 
 def _collocation(name: str, polynomial: Callable[[Any], Any], degree: int, order: int, source: str) -> Method:

@@ -1,9 +1,10 @@
-"""Inelastic stops of joint angles, as source that generated kernels take in whole.
+"""A hold, from event to event, as source that generated kernels take in whole.
 
-An impact clamps the angle and takes away that joint's rate; the other pseudo-velocities of an
-orthogonal frame keep theirs, because the stop's reaction has a component along that joint's
-vector field only. Afterwards the joint either stays on its stop, while its torque presses
-outward, or leaves it at once.
+A flight whose estimated error is too large is halved until it is not. Within a flight, inelastic
+stops of joint angles act where they are met. An impact clamps the angle and takes away that joint's
+rate; the other pseudo-velocities of an orthogonal frame keep theirs, because the stop's reaction has
+a component along that joint's vector field only. Afterwards the joint either stays on its stop, while
+what acts on it presses outward, or leaves it at once.
 
 Every function here is plain Python over arrays and runs compiled or not. Names in the section
 below are stand-ins for what the generated module defines itself.
@@ -12,16 +13,18 @@ below are stand-ins for what the generated module defines itself.
 from math import copysign, inf, sqrt
 from typing import Any
 
-__all__ = ["CONSTANTS", "PURE", "SOURCES", "first_hit", "guess", "hold", "refine", "settle", "zero"]
+from numpy import array, int64
+
+__all__ = ["CONSTANTS", "PURE", "SOURCES", "first_event", "guess", "hold", "refine", "settle", "value_of", "zero"]
 
 Array = Any  # NumPy array, or Numba's view of one
 
-ANGLES: tuple[int, ...] = ()  # places in `state` of the angles of the joints that have stops
-RATES: tuple[int, ...] = ()  # and of their pseudo-velocities
+ANGLES = array((), int64)  # places in `state` of the angles of the joints that have stops
+RATES = array((), int64)  # and of their pseudo-velocities
 
 
-def advance(h: float, state: Array, control: Array, free: Array, k: Array, new: Array) -> None:
-    """Write the state after `h` seconds to `new`; joint j is held where free[j] is 0."""
+def advance(h: float, state: Array, control: Array, free: Array, k: Array, new: Array) -> bool:
+    """Write the state after `h` seconds to `new`; joint j is held where free[j] is 0. Returns whether it is right."""
     raise NotImplementedError
 
 
@@ -30,26 +33,34 @@ def motion(state: Array, control: Array, k: Array, out: Array) -> None:
     raise NotImplementedError
 
 
-MAX_EVENTS = 64  # impacts within one hold; a joint needs a full swing between two
+MAX_FLIGHTS = 10_000  # within one hold, each from event to event or as long as it can be integrated at once
+SHORTEST = 2.0**-24  # flight, of the hold
 MAX_ITERATIONS = 100  # bisection alone needs 53
 TIME_TOLERANCE = 1e-13  # of the hold: at 100 rad/s and 0.05 s, the angle is right to 5e-13 rad
 
-CONSTANTS = ("MAX_EVENTS", "MAX_ITERATIONS", "TIME_TOLERANCE")
+# What passes a level: a joint's angle, its rate, or the acceleration that it would have if it were not held.
+ANGLE, RATE, PUSH = 0, 1, 2
+
+CONSTANTS = ("MAX_FLIGHTS", "SHORTEST", "MAX_ITERATIONS", "TIME_TOLERANCE", "ANGLE", "RATE", "PUSH")
 
 
 def hold(
     h: float, state: Array, control: Array, k: Array, limits: Array, free: Array, work: Array, hits: Array, new: Array
-) -> int:
-    """Advance `state` in place by `h` seconds with the controls held, through every impact.
+) -> bool:
+    """Advance `state` in place by `h` seconds with the controls held, through every event.
 
-    On entry `new` holds the state after `h` seconds without stops, unless a joint is at its stop.
-    Returns the number of impacts.
+    Returns whether that could be done to the tolerance; if not, `state` is where it could be done until.
     """
-    left, known, impacts = h, True, 0
-    for _ in range(MAX_EVENTS):
-        if settle(state, control, k, limits, free, work) or not known:
-            advance(left, state, control, free, k, new)
-        time, there = first_hit(left, state, control, k, limits, free, work, hits, new)
+    left = longest = h
+    for _ in range(MAX_FLIGHTS):
+        settle(state, control, k, limits, free, work)
+        flight = min(longest, left)
+        while not advance(flight, state, control, free, k, new):
+            flight *= 0.5
+            if flight < SHORTEST * h:
+                return False
+        longest = 2.0 * flight
+        time, there = first_event(flight, state, control, k, limits, free, work, hits, new)
         if time != there:
             advance(time, state, control, free, k, new)
         for i in range(len(state)):  # state[:] = new costs Numba two seconds more to compile
@@ -58,75 +69,66 @@ def hold(
             if hits[j] <= time:
                 state[ANGLES[j]] = copysign(limits[j], state[ANGLES[j]])
                 state[RATES[j]] = 0.0
-                impacts += 1
         left -= time
-        known = False
         if left <= 0.0:
-            return impacts
-    # Never seen, as an inelastic stop does not bounce; joints at a stop rest there for what is left.
-    for j in range(len(ANGLES)):
-        free[j] = 0.0 if abs(state[ANGLES[j]]) >= limits[j] else 1.0
-    advance(left, state, control, free, k, new)
-    for i in range(len(state)):
-        state[i] = new[i]
-    return impacts
+            return True
+    return False
 
 
-def settle(state: Array, control: Array, k: Array, limits: Array, free: Array, work: Array) -> bool:
-    """Set free[j] to 0 for each joint that rests on its stop and is pressed outward, else to 1.
-
-    Returns whether anything is now other than free flight from the given state.
-    """
-    changed = False
+def settle(state: Array, control: Array, k: Array, limits: Array, free: Array, work: Array) -> None:
+    """Set free[j] to 0 for each joint that rests on its stop and is pressed outward, else to 1."""
     for j in range(len(ANGLES)):
         free[j] = 1.0
         angle = state[ANGLES[j]]
         if abs(angle) >= limits[j]:
-            changed = True
             state[ANGLES[j]] = copysign(limits[j], angle)
             if state[RATES[j]] * angle >= 0.0:
                 state[RATES[j]] = 0.0
                 motion(state, control, k, work)
                 if work[len(ANGLES) + j] * angle >= 0.0:
                     free[j] = 0.0
-    return changed
 
 
-def first_hit(
+def first_event(
     h: float, state: Array, control: Array, k: Array, limits: Array, free: Array, work: Array, hits: Array, new: Array
 ) -> tuple[float, float]:
-    """Time of the first impact within `h` seconds, or `h`; and the time of the state that `new` holds.
+    """Time of the first impact or release within `h` seconds, or `h`; and the time of the state that `new` holds.
 
-    On entry that is `h`. hits[j] is set to joint j's own time, infinite if it has no impact.
+    On entry that is `h`. hits[j] is set to the time of joint j's own impact, infinite if it has none.
     """
     first = there = h
     for j in range(len(ANGLES)):
         hits[j] = inf
-        if free[j] == 0.0:
-            continue
         angle, end, limit = ANGLES[j], h, limits[j]
         if there != h:
             advance(h, state, control, free, k, new)
             there = h
+        if free[j] == 0.0:
+            motion(new, control, k, work)
+            side = copysign(1.0, state[angle])
+            if side * work[len(ANGLES) + j] < 0.0:
+                first = min(first, zero(j, PUSH, -side, 0.0, h, state, control, k, free, work, new))
+                there = -1.0
+            continue
         if state[RATES[j]] * new[RATES[j]] < 0.0:
             # It turned on the way: perhaps beyond the stop that it went for first, if it could get so far.
             motion(state, control, k, work)
             side = copysign(1.0, state[RATES[j]])
             if side * state[angle] + h * abs(work[j]) > limit:
-                end = there = zero(j, True, -side, 0.0, h, state, control, k, free, work, new)
+                end = there = zero(j, RATE, -side, 0.0, h, state, control, k, free, work, new)
                 if side * new[angle] <= limit:
                     advance(h, state, control, free, k, new)
                     end = there = h
         if abs(new[angle]) > limit:
             side = copysign(1.0, new[angle])
-            hits[j] = there = zero(j, False, side, limit, end, state, control, k, free, work, new)
+            hits[j] = there = zero(j, ANGLE, side, limit, end, state, control, k, free, work, new)
             first = min(first, hits[j])
     return first, there
 
 
 def zero(
     j: int,
-    turning: bool,
+    kind: int,
     sign: float,
     level: float,
     end: float,
@@ -137,26 +139,34 @@ def zero(
     work: Array,
     new: Array,
 ) -> float:
-    """Time in (0, end] at which joint j's angle, or its rate if `turning`, passes `level` upward.
+    """Time in (0, end] at which sign times a value of joint j passes `level` upward; `kind` says which value.
 
-    What passes is sign * value. Newton's method, kept in a bracket by bisection; `new` holds the
-    state at `end` on entry, and the state at the time returned on leaving.
+    Newton's method, kept in a bracket by bisection, which alone serves a push. `new` holds the state at `end` on entry,
+    and for an angle or a rate the state at the time returned on leaving. A push has just passed at that time.
     """
-    place, slope = (RATES[j], len(ANGLES) + j) if turning else (ANGLES[j], j)
     low, high = 0.0, end
-    below, above = sign * state[place] - level, sign * new[place] - level
     motion(new, control, k, work)
-    rate_above = sign * work[slope]
+    above, rate_above = value_of(j, kind, new, work)
     motion(state, control, k, work)
-    time = guess(below, above, sign * work[slope], rate_above, end)
+    below, rate_below = value_of(j, kind, state, work)
+    time = guess(sign * below - level, sign * above - level, sign * rate_below, sign * rate_above, end)
     for _ in range(MAX_ITERATIONS):
         advance(time, state, control, free, k, new)
         motion(new, control, k, work)
-        better, low, high = refine(time, low, high, sign * new[place] - level, sign * work[slope], end)
+        value, rate = value_of(j, kind, new, work)
+        better, low, high = refine(time, low, high, sign * value - level, sign * rate, end)
         if better == time:
             break
         time = better
-    return time
+    return high if kind == PUSH else time
+
+
+def value_of(j: int, kind: int, state: Array, work: Array) -> tuple[float, float]:
+    """What `zero` watches, in a state whose `motion` is in `work`, and its rate, 0 where that is not known."""
+    push = work[len(ANGLES) + j]
+    if kind == ANGLE:
+        return state[ANGLES[j]], work[j]
+    return (state[RATES[j]], push) if kind == RATE else (push, 0.0)
 
 
 def guess(below: float, above: float, rate: float, rate_above: float, end: float) -> float:
@@ -199,4 +209,4 @@ def refine(time: float, low: float, high: float, value: float, rate: float, end:
 
 # In the order in which a module that contains them defines them; those that are worth a place inside others first.
 PURE = (guess, refine)
-SOURCES = (zero, first_hit, settle, hold)
+SOURCES = (value_of, zero, first_event, settle, hold)

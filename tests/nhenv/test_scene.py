@@ -67,8 +67,8 @@ def test_default_integrators_are_those_of_the_design(source):
 
 def test_no_stop_no_code_for_stops(source):
     for name in NAMES:
-        assert "first_hit" in source(name)
-        assert "first_hit" not in source(name, stops=False)
+        assert "first_event" in source(name)
+        assert "first_event" not in source(name, stops=False)
 
 
 def test_no_target_and_no_end_no_code_for_them(source):

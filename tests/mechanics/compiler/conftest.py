@@ -41,7 +41,8 @@ def stepper(execute):
         k = np.array(functions["constants"](list(parameters.values())), dtype=float)
 
         def step(h, state, controls=()):
-            values = functions["step"](h, *(state[s] for s in flow.states), *controls, k)
+            *values, right = functions["step"](h, *(state[s] for s in flow.states), *controls, k)
+            assert right
             return dict(zip(flow.states, values, strict=True))
 
         step.source = source
