@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -19,9 +20,10 @@ from nhenv import tasks
 from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
 from nhenv.scene import Scene
 
-__all__ = ["Configuration"]
+__all__ = ["Configuration", "passes_arguments_on"]
 
 Array = NDArray[np.float64]
+Init = TypeVar("Init", bound=Callable[..., None])
 
 TOLERANCE = 1e-10
 SMALLEST_TOLERANCE = 1e-13
@@ -153,7 +155,8 @@ class Configuration:
         values = dict(self.task.weights)
         for name, value in given.items():
             if name not in values:
-                raise TypeError(f"{self.mechanism.name}, {self.task.name}: {unknown_name('argument', name, values)}")
+                known = [*inspect.signature(Configuration).parameters][:-1] + [*values]  # the last stands for weights
+                raise TypeError(f"{self.mechanism.name}, {self.task.name}: {unknown_name('argument', name, known)}")
             values[name] = _number(name, value)
             if not math.isfinite(values[name]):
                 raise ValueError(f"{name} must be finite, got {value}")
@@ -191,6 +194,16 @@ class Configuration:
         if not 0 <= number < smallest:
             raise ValueError(f"reset_noise_scale must be at least 0 and below the stops at {smallest} rad, got {scale}")
         return number
+
+
+def passes_arguments_on(init: Init) -> Init:
+    """Decorator of an `__init__` whose `**arguments` go to `Configuration`: its signature shows them by name."""
+    own = inspect.signature(init)
+    named = [given for given in own.parameters.values() if given.kind is not given.VAR_KEYWORD]
+    others = inspect.signature(Configuration).parameters.values()
+    everything = [*named, *(other for other in others if other.name not in own.parameters)]
+    init.__signature__ = own.replace(parameters=everything)  # type: ignore[attr-defined]
+    return init
 
 
 def _array(what: str, value: Any, shape: tuple[int, ...], mask: NDArray[np.bool_] | None) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.expressions import unknown_name
 from mechanics.model import Model
-from nhenv.configuration import Configuration
+from nhenv.configuration import Configuration, passes_arguments_on
 from nhenv.registration import MechanismLike, TaskLike
 from nhenv.replay import Replay
 from nhenv.scene import BAD_ACTION, HISTORY_FULL, TERMINATED, Scene
@@ -145,46 +145,13 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own declaration)
 
-    def __init__(
-        self,
-        mechanism: MechanismLike,
-        task: TaskLike = "Forward",
-        *,
-        params: Mapping[str, float] | None = None,
-        dt: float = 0.05,
-        torque_limits: Mapping[str, float] | ArrayLike | None = None,
-        joint_limits: bool | Mapping[str, float] = True,
-        frame: str | None = None,
-        integrator: str = "auto",
-        substeps: int | None = None,
-        tolerance: float | None = None,
-        reset_noise_scale: float = 0.05,
-        backend: str = "numba",
-        whole_state: bool = False,
-        render_mode: str | None = None,
-        **weights: float,
-    ) -> None:
-        self._configuration = configuration = Configuration(
-            mechanism,
-            task,
-            params=params,
-            dt=dt,
-            torque_limits=torque_limits,
-            joint_limits=joint_limits,
-            frame=frame,
-            integrator=integrator,
-            substeps=substeps,
-            tolerance=tolerance,
-            reset_noise_scale=reset_noise_scale,
-            backend=backend,
-            whole_state=whole_state,
-            render_mode=render_mode,
-            **weights,
-        )
+    @passes_arguments_on
+    def __init__(self, mechanism: MechanismLike, task: TaskLike = "Forward", **arguments: Any) -> None:
+        self._configuration = configuration = Configuration(mechanism, task, **arguments)
         self.mechanism, self.task = configuration.mechanism, configuration.task
         self.params, self.dt = configuration.params, configuration.dt
         self.torque_limits, self.joint_limits = configuration.torque_limits, configuration.joint_limits
-        self.reset_noise_scale, self.frame = configuration.reset_noise_scale, frame
+        self.reset_noise_scale, self.frame = configuration.reset_noise_scale, configuration.scene.frame
         self._scene = configuration.scene
         self.action_space = configuration.action_space
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (len(self._scene.kernel.OBSERVATION),), np.float32)

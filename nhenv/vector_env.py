@@ -19,7 +19,7 @@ from mechanics.expressions import unknown_name
 from mechanics.mechanism import MechanismError
 from mechanics.model import Model
 from nhenv import random_streams, rows
-from nhenv.configuration import Configuration
+from nhenv.configuration import Configuration, passes_arguments_on
 from nhenv.registration import MechanismLike, TaskLike
 
 __all__ = ["LocomotionVectorEnv"]
@@ -91,6 +91,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own declaration)
     _crew: _Crew | None = None  # closing an environment that could not be made looks for it
 
+    @passes_arguments_on
     def __init__(
         self,
         mechanism: MechanismLike,

@@ -15,7 +15,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 import mechanics
 import nhenv
 from mechanics.model import Model
+from nhenv.configuration import Configuration
 from nhenv.env import LocomotionEnv
+from nhenv.vector_env import LocomotionVectorEnv
 
 STEPS = 300  # of an episode, as registered
 # The same in every step, unless the goal is reached.
@@ -69,6 +71,16 @@ def test_stable_baselines3_checker(env_id, make):
 
 def test_make_by_module_and_id(env_id, make):
     assert isinstance(make(f"nhenv:{env_id}").unwrapped, LocomotionEnv)
+
+
+@pytest.mark.parametrize("face", [LocomotionEnv, LocomotionVectorEnv])
+def test_signatures_show_every_argument(face):
+    """Those that are passed on too, with their defaults, and the docstring names those that are new."""
+    shown = inspect.signature(face).parameters
+    for name, passed_on in inspect.signature(Configuration).parameters.items():
+        assert (shown[name].default, shown[name].kind) == (passed_on.default, passed_on.kind)
+    explained = inspect.getdoc(LocomotionEnv) + inspect.getdoc(face)
+    assert all(f"\n    {name}: " in explained for name in shown.keys() - {"weights"})
 
 
 def test_a_mechanism_of_the_users_own_needs_no_registration(actions):

@@ -49,6 +49,7 @@ ARGUMENTS = {
     "mechanism misspelt": (RACER, {"mechanism": "roler_racer"}, MechanismError, ["'roler_racer'", "known", "mean"]),
     "task misspelt": (SNAKEBOARD, {"task": "Foward"}, ValueError, ["'Foward'", "known", "mean 'Forward'"]),
     "weight misspelt": (RACER, {"ctrl_cost_wieght": 0.1}, TypeError, ["'ctrl_cost_wieght'", "mean 'ctrl_cost_weight'"]),
+    "argument misspelt": (RACER, {"torque_limit": 1}, TypeError, ["'torque_limit'", "dt", "mean 'torque_limits'"]),
     "weight NaN": (RACER, {"ctrl_cost_weight": np.nan}, ValueError, ["ctrl_cost_weight", "finite", "nan"]),
     "backend misspelt": (RACER, {"backend": "nunba"}, ValueError, ["'nunba'", "numpy", "mean 'numba'"]),
     "substeps zero": (RACER, {"substeps": 0}, ValueError, ["substeps", "positive whole", "got 0"]),
@@ -78,8 +79,8 @@ def test_every_kind_of_argument_is_refused_somewhere():
     """A new argument of the environment needs a case above."""
     tried = {name for _, arguments, _, _ in ARGUMENTS.values() for name in arguments}
     named = inspect.signature(LocomotionEnv).parameters
-    tried.discard("ctrl_cost_wieght")
-    assert tried - {"ctrl_cost_weight"} == set(named) - {"render_mode", "weights"}
+    tried -= {"ctrl_cost_weight", "ctrl_cost_wieght", "torque_limit"}
+    assert tried == set(named) - {"render_mode", "weights"}
 
 
 def test_drawing_is_refused():
