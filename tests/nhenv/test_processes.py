@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import nhenv
+from nhenv.vector_calls import Crew
 
 ID = "nhenv/SnakeboardForward-v0"
 ROOT = Path(__file__).parents[2]
@@ -71,7 +72,7 @@ def _run_kept():
 def test_a_fork_goes_on_where_its_parent_is(threads):
     """Threads do not survive a fork; the child's environment must not wait for them."""
     _kept["env"] = env = _begin(threads=threads)
-    assert (threads == 1) == (env._crew is None)
+    assert (threads > 1) == isinstance(env._running, Crew)
     there = _in_process("fork", _run_kept)
     assert there == _run(env)
     env.close()
@@ -128,6 +129,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import nhenv
+from nhenv.vector_calls import Crew
 
 env = gym.make_vec("nhenv/SnakeboardForward-v0", num_envs=3, backend=sys.argv[1])
 observations, _ = env.reset(seed=0)

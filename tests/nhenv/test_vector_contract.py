@@ -729,12 +729,12 @@ def test_parameters_of_rows_that_share_them(rows):
 def test_impossible_parameters_of_rows(rows, given, words):
     """Refused, and none of them is taken."""
     env = rows(params={"m": np.array([4.0, 5.0, 6.0])})
-    blocks = env._blocks.copy()
+    blocks = env._memory.blocks.copy()
     with pytest.raises(ValueError, match=r".") as error:
         env.set_params(**given)
     _message(error, *words)
     assert env.params["m"].tolist() == [4.0, 5.0, 6.0]
-    assert np.array_equal(env._blocks, blocks)
+    assert np.array_equal(env._memory.blocks, blocks)
 
 
 def test_parameters_of_some_rows_before_the_first_reset(rows):
