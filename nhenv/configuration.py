@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import reprlib
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, TypeVar
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mechanics.compiler.integrators import method
 from mechanics.expressions import evaluate, unknown_name
 from mechanics.model import Model
-from nhenv import tasks
+from nhenv import checks, tasks
 from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
 from nhenv.scene import Scene
 
@@ -65,8 +64,6 @@ class Configuration:
     ) -> None:
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, got {render_mode!r}: these environments do not draw")
-        if substeps is not None and (isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1):
-            raise ValueError(f"substeps must be a positive whole number or None, got {substeps!r}")
         if not isinstance(whole_state, bool | np.bool_):
             raise ValueError(f"whole_state must be True or False, got {whole_state!r}")
         self.mechanism = in_the_plane(as_mechanism(mechanism))
@@ -74,7 +71,7 @@ class Configuration:
         if problem := unfit(self.mechanism, self.task):
             raise ValueError(problem)
         self.params = self.mechanism.resolve(params)
-        self.dt = _positive("dt", dt)
+        self.dt = checks.positive("dt", dt)
         self.torque_limits = self._torque_limits(torque_limits)
         self.joint_limits = self._joint_limits(joint_limits)
         self.reset_noise_scale = self._noise(reset_noise_scale)
@@ -85,7 +82,7 @@ class Configuration:
             frame=frame,
             stops=bool(self.joint_limits),
             integrator=integrator,
-            substeps=substeps,
+            substeps=None if substeps is None else checks.whole("substeps", substeps),
             tolerance=_tolerance(tolerance, integrator),
             backend=backend,
             whole_state=bool(whole_state),
@@ -130,13 +127,13 @@ class Configuration:
         for name, value in given.items():
             if name not in self.task.targets:
                 raise ValueError(f"reset option 'target': {unknown_name('target', str(name), self.task.targets)}")
-            values[name] = _array(f"reset option 'target': {name}", value, (), mask)
+            values[name] = checks.array(f"reset option 'target': {name}", value, (), mask)
         return values
 
     def state_given(self, options: Mapping[str, Any], key: str, mask: NDArray[np.bool_] | None = None) -> Array:
         """Coordinates or velocities in the `options` of a reset, shape (n,); with a mask as for targets."""
         names = ", ".join(self.mechanism.coordinates)
-        return _array(f"reset option {key!r} ({names})", options[key], (self.mechanism.n,), mask)
+        return checks.array(f"reset option {key!r} ({names})", options[key], (self.mechanism.n,), mask)
 
     def check_stops(self, q: Array) -> None:
         """Refuse coordinates (..., n) beyond a stop."""
@@ -157,7 +154,7 @@ class Configuration:
             if name not in values:
                 known = [*inspect.signature(Configuration).parameters][:-1] + [*values]  # the last stands for weights
                 raise TypeError(f"{self.mechanism.name}, {self.task.name}: {unknown_name('argument', name, known)}")
-            values[name] = _number(name, value)
+            values[name] = checks.number(name, value)
             if not math.isfinite(values[name]):
                 raise ValueError(f"{name} must be finite, got {value}")
         return values
@@ -175,7 +172,7 @@ class Configuration:
             if array.shape not in ((), (len(controls),)):
                 raise ValueError(f"torque_limits must be one number for each of {', '.join(controls)}, got {given!r}")
             values = dict(zip(controls, np.broadcast_to(array, len(controls)), strict=True))
-        return np.array([_positive(f"torque limit of {name}", value) for name, value in values.items()])
+        return np.array([checks.positive(f"torque limit of {name}", value) for name, value in values.items()])
 
     def _joint_limits(self, given: bool | Mapping[str, float]) -> dict[str, float]:
         values = dict(self.mechanism.joint_limits)
@@ -186,11 +183,11 @@ class Configuration:
         for name, value in given.items():
             if name not in values:
                 raise ValueError(f"joint_limits: {unknown_name('joint', str(name), values)}")
-            values[name] = _positive(f"joint limit of {name}", value)
+            values[name] = checks.positive(f"joint limit of {name}", value)
         return values
 
     def _noise(self, scale: float) -> float:
-        smallest, number = min(self.joint_limits.values(), default=math.inf), _number("reset_noise_scale", scale)
+        smallest, number = min(self.joint_limits.values(), default=math.inf), checks.number("reset_noise_scale", scale)
         if not 0 <= number < smallest:
             raise ValueError(f"reset_noise_scale must be at least 0 and below the stops at {smallest} rad, got {scale}")
         return number
@@ -206,27 +203,11 @@ def passes_arguments_on(init: Init) -> Init:
     return init
 
 
-def _array(what: str, value: Any, shape: tuple[int, ...], mask: NDArray[np.bool_] | None) -> Array:
-    """An array of finite numbers of this shape; or with a mask, perhaps one for each row, of the rows in it."""
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}") from None
-    shapes = [shape] if mask is None else [shape, (len(mask), *shape)]
-    if array.shape not in shapes:
-        raise ValueError(f"{what} must have shape {' or '.join(map(str, shapes))}, got {array.shape}")
-    if mask is not None and array.shape != shape:
-        array = array[mask]
-    if not np.isfinite(array).all():
-        raise ValueError(f"{what} must be finite, got {reprlib.repr(array.tolist())}")
-    return array
-
-
 def _tolerance(given: float | None, integrator: str) -> float:
     """The tolerance that a scene takes: without one, methods that are asked for by name step as they are."""
     if given is None:
         return TOLERANCE if integrator == "auto" else math.inf
-    number = _positive("tolerance", given)
+    number = checks.positive("tolerance", given)
     if not SMALLEST_TOLERANCE <= number < 1:
         raise ValueError(
             f"tolerance must be at least {SMALLEST_TOLERANCE}, because of roundings, and below 1, got {given!r}"
@@ -236,18 +217,4 @@ def _tolerance(given: float | None, integrator: str) -> float:
             f"tolerance={given!r} needs an estimate of the error, and integrator {integrator!r} has too few stages for "
             "one; choose another, or tolerance=None"
         )
-    return number
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number, got {value!r}") from None
-
-
-def _positive(name: str, value: Any) -> float:
-    number = _number(name, value)
-    if not (math.isfinite(number) and number > 0):
-        raise ValueError(f"{name} must be positive and finite, got {value!r}")
     return number

@@ -31,6 +31,7 @@ except ImportError as problem:
         f'nhenv.sb3 needs Stable-Baselines3 ({problem}): run pip install "nhenv[train]"'
     ) from problem
 
+from nhenv import checks
 from nhenv.registration import VECTOR_ENTRY_POINT
 from nhenv.vector_env import LocomotionVectorEnv
 
@@ -66,8 +67,7 @@ def make_sb3_vec_env(
         ValueError: an argument has a value that cannot be.
     """
     spec = _spec(env_id)
-    if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
-        raise ValueError(f"n_envs must be a positive whole number, got {n_envs!r}")
+    n_envs = checks.whole("n_envs", n_envs)
     for name in _DECIDED_HERE:
         if name in env_kwargs:
             raise ValueError(

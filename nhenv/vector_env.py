@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.expressions import unknown_name
 from mechanics.mechanism import MechanismError
-from nhenv import random_streams, rows, vector_input
+from nhenv import checks, random_streams, rows, vector_input
 from nhenv.configuration import Configuration, passes_arguments_on
 from nhenv.registration import MechanismLike, TaskLike
 from nhenv.vector_calls import Crew, stepper
@@ -101,10 +101,10 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         torque_limits: Mapping[str, ArrayLike] | ArrayLike | None = None,
         **arguments: Any,
     ) -> None:
-        self.num_envs = size = vector_input.whole("num_envs", num_envs)
+        self.num_envs = size = checks.whole("num_envs", num_envs)
         endless = max_episode_steps is None or max_episode_steps == -1
-        self.max_episode_steps = None if endless else vector_input.whole("max_episode_steps", max_episode_steps)
-        self.threads = vector_input.whole("threads", threads)
+        self.max_episode_steps = None if endless else checks.whole("max_episode_steps", max_episode_steps)
+        self.threads = checks.whole("threads", threads)
         self.autoreset_mode = vector_input.autoreset_mode(autoreset_mode)
         self.info = vector_input.info_level(info)
         own_params, own_limits = vector_input.arrays("params", params or {}, size), {}

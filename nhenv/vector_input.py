@@ -1,4 +1,4 @@
-"""What a vector environment is given, checked: sizes and modes, numbers for each row, masks, seeds and actions."""
+"""What a vector environment is given, checked: modes, numbers for each row, masks, seeds and actions."""
 
 from __future__ import annotations
 
@@ -13,19 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.expressions import unknown_name
 
-__all__ = ["FLOATS", "Seeds", "actions", "arrays", "autoreset_mode", "info_level", "mask", "seeds", "whole"]
+__all__ = ["FLOATS", "Seeds", "actions", "arrays", "autoreset_mode", "info_level", "mask", "seeds"]
 
 Seeds = int | Sequence[int | None] | None
 
 LEVELS = ("none", "final", "all")
 FLOATS = {np.dtype(np.float32), np.dtype(np.float64)}  # what kernels read as it is, in the machine's own byte order
-
-
-def whole(name: str, value: Any) -> int:
-    """A positive whole number."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name} must be a positive whole number, got {value!r}")
-    return int(value)
 
 
 def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
