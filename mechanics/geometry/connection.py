@@ -14,12 +14,12 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property, reduce
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from mechanics.expressions import to_sympy
 from mechanics.geometry.algebra import Algebra, Element
 from mechanics.geometry.compact import Writer
+from mechanics.geometry.samples import sample_points
 from mechanics.mechanism import Mechanism, MechanismError
 
 __all__ = ["Connection"]
@@ -201,11 +201,9 @@ class Connection:
         if found.keys() <= self._generators.keys():
             return
         self._generators |= found
-        # At random points, to see which factors are positive; parameters near their defaults.
-        rng = np.random.default_rng(3)
-        symbols = sorted({*self.coordinates}.union(*(g.free_symbols for g in self._generators)), key=str)
-        samples = {symbol.name: rng.uniform(-np.pi, np.pi, 200) for symbol in symbols}
-        samples |= {name: value * rng.uniform(0.9, 1.1, 200) for name, value in self.mechanism.parameters.items()}
+        known = {*self.mechanism.parameters, *self.mechanism.drag}
+        names = {str(symbol) for g in (*self.coordinates, *self._generators) for symbol in g.free_symbols}
+        samples = sample_points(self.mechanism, sorted(names - known))
         self._algebra = Algebra(self._generators, samples)
         self._writer = Writer(self._algebra, self._definitions, self._entries, self.coordinates)
         self._elements: dict[sp.Expr, Element] = {}

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import combinations
 
-import numpy as np
 import sympy as sp
 
 from mechanics.geometry.algebra import Algebra, Element, TooLong
 from mechanics.geometry.closures import Calculus, Field, SymmetricProducts
 from mechanics.geometry.compact import Writer
 from mechanics.geometry.reduction import ReducedEquations
+from mechanics.geometry.samples import sample_points
 from mechanics.mechanism import MechanismError
 
 __all__ = ["Formulas"]
@@ -34,9 +34,7 @@ class Formulas:
             definitions = [scope[name] for name in m.definitions]
             masses = [m.symbolic(row[a]) for a, row in enumerate(m.inertia)]
             entries = [*e.frame, *sp.flatten(e.christoffel), *(y for _, field in inputs for y in field)]
-            rng = np.random.default_rng(8)  # values of the symbols, to see which factors are positive
-            samples = {s.name: rng.uniform(-np.pi, np.pi, 100) for s in e.coordinates}
-            samples |= {name: value * rng.uniform(0.9, 1.1, 100) for name, value in m.parameters.items()}
+            samples = sample_points(m, m.coordinates)
             algebra = self._algebra = Algebra([*definitions, *entries, *e.squared_norms, *masses], samples)
             self._writer = Writer(algebra, definitions, [*e.frame, *masses], e.coordinates)
             self._calculus = Calculus(e, inputs, algebra)

@@ -24,13 +24,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from mechanics.expressions import to_sympy
 from mechanics.geometry.algebra import Algebra, TooLong
 from mechanics.geometry.compact import Product, Writer, nested_sum
 from mechanics.geometry.frames import null_frame, orthogonalise
+from mechanics.geometry.samples import sample_points
 from mechanics.geometry.symmetry import planar_symmetry
 from mechanics.geometry.tape import Tape
 from mechanics.mechanism import Matrix, Mechanism
@@ -166,14 +166,15 @@ class _Reduction:
         potential = to_sympy(mechanism.potential, scope)
         rayleigh = _rayleigh(mechanism, scope) if drag else []
         everything = [*sum(vectors, []), *sum(inertia, []), *sum(forces, []), potential, *sum(rayleigh, [])]
+        samples = sample_points(mechanism, map(str, (*self.q, *self.v)))
         algebra: Any
         self.product: Callable[[Number], Product]
         if exact:
-            algebra = Algebra([*definitions, *everything], _samples(mechanism))
+            algebra = Algebra([*definitions, *everything], samples)
             self.product = Writer(algebra, definitions, everything, self.q).product
             self.definitions: Callable[[], dict[sp.Symbol, sp.Expr]] = dict
         else:
-            algebra = Tape(_samples(mechanism), frozenset(map(sp.Symbol, (*mechanism.parameters, *mechanism.drag))))
+            algebra = Tape(samples, frozenset(map(sp.Symbol, (*mechanism.parameters, *mechanism.drag))))
             self.product, self.definitions = algebra.product, algebra.definitions
         self.algebra = algebra
 
@@ -398,13 +399,3 @@ def _rayleigh(mechanism: Mechanism, scope: Mapping[str, sp.Expr]) -> list[list[s
     rates = [sp.Symbol(name) for name in mechanism.rates]
     function = to_sympy(mechanism.rayleigh, {**scope, **{rate.name: rate for rate in rates}})
     return [[sp.diff(function, a, b) for b in rates] for a in rates]
-
-
-def _samples(mechanism: Mechanism) -> dict[str, Any]:
-    """Values at random points of the whole configuration space, to see which factors are positive."""
-    rng = np.random.default_rng(3)
-    count = 200
-    numbers = {**mechanism.parameters, **mechanism.drag}
-    values = {name: value * rng.uniform(0.9, 1.1, count) for name, value in numbers.items()}
-    moving = (*mechanism.coordinates, *(f"v{i + 1}" for i in range(mechanism.rank)))
-    return values | {name: rng.uniform(-np.pi, np.pi, count) for name in moving}
