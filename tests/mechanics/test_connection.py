@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import paper
 import pytest
 import sympy as sp
 from oracles import multiplier_acceleration
@@ -307,11 +308,9 @@ def test_eulers_equations():
 
 def test_symmetric_products_and_brackets_of_section_6():
     """<X2 : X3> = J_r/(m l²) cosφ X1 - J_r cosφ sinφ/D X2 (D corrected), [X1, X3] and [X1, [X1, X3]]."""
+    D, J_r, l, m, theta, phi = paper.D, paper.J_r, paper.l, paper.m, paper.theta, paper.phi
     c, e = connection("snakeboard"), reduce(MECHANISMS["snakeboard"], "paper")
     X1, X2, X3 = (e.frame[:, i] for i in range(3))
-    m, l, J_r = sp.symbols("m l J_r")
-    theta, phi = sp.symbols("theta phi")
-    D = m * l**2 - J_r * sp.sin(phi) ** 2
     product = J_r / (m * l**2) * sp.cos(phi) * X1 - J_r * sp.cos(phi) * sp.sin(phi) / D * X2
     assert zero(c.simplify(c.symmetric_product(X2, X3) - product))
     assert zero(c.symmetric_product(X2, X2))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 import zoo
+from paper import I_1, I_2, D, H, J_r, c, f_1, f_2, f_3, k, l, l_1, l_2, m, phi, psi, theta
 
 import mechanics
 from mechanics import Mechanism, MechanismError
@@ -17,15 +18,6 @@ from mechanics.geometry.algebra import TooLong
 from mechanics.geometry.controllability import analyse
 from mechanics.geometry.jets import DIGITS, PoleError, Span, Taylor
 from mechanics.geometry.verdict import Point
-
-m, l, J_r, l_1, l_2, I_1, I_2 = sp.symbols("m l J_r l_1 l_2 I_1 I_2")
-theta, psi, phi = sp.symbols("theta psi phi")
-D = m * l**2 - J_r * sp.sin(phi) ** 2
-c, H = l_2 + l_1 * sp.cos(psi), l_1 + l_2 * sp.cos(psi)
-k = l_2 * I_1 - l_1 * I_2 * sp.cos(psi)
-f_1 = m * c**2 + (I_1 + I_2) * sp.sin(psi) ** 2
-f_2 = m * l_2**2 * I_1 + m * l_1**2 * I_2 * sp.cos(psi) ** 2 + I_1 * I_2 * sp.sin(psi) ** 2
-f_3 = l_1 * I_2 - l_2 * I_1 * sp.cos(psi) + m * l_1 * l_2 * c
 
 SNAKEBOARD = mechanics.get("snakeboard")
 RACER = mechanics.get("roller_racer")

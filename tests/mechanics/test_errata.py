@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from oracles import multiplier_acceleration
+from paper import I_1, I_2, D, H, J_r, c, f_1, f_2, f_3, k, l, l_1, l_2, m, phi, psi, theta, u_psi, v1, v2, v3
 
 import mechanics
 from mechanics.geometry import reduce
@@ -16,16 +17,8 @@ from mechanics.geometry import reduce
 AGREES = 1e-11
 MISPRINT = 1e-3
 
-m, l, J_r, J_w, l_1, l_2, I_1, I_2, u_psi = sp.symbols("m l J_r J_w l_1 l_2 I_1 I_2 u_psi")
-x, y, theta, psi, phi = sp.symbols("x y theta psi phi")
-v1, v2, v3 = sp.symbols("v1 v2 v3")
 s, co = sp.sin(phi), sp.cos(phi)
-D_PRINTED, D = m * l**2 + J_r * s**2, m * l**2 - J_r * s**2
-c, H = l_2 + l_1 * sp.cos(psi), l_1 + l_2 * sp.cos(psi)
-k = l_2 * I_1 - l_1 * I_2 * sp.cos(psi)
-f_1 = m * c**2 + (I_1 + I_2) * sp.sin(psi) ** 2
-f_2 = m * l_2**2 * I_1 + m * l_1**2 * I_2 * sp.cos(psi) ** 2 + I_1 * I_2 * sp.sin(psi) ** 2
-f_3 = l_1 * I_2 - l_2 * I_1 * sp.cos(psi) + m * l_1 * l_2 * c
+D_PRINTED = m * l**2 + J_r * s**2
 
 
 def state(mechanism, seed=11, **velocities):

@@ -5,6 +5,7 @@ import pytest
 import sympy as sp
 import zoo
 from oracles import frame_acceleration, multiplier_acceleration
+from paper import I_1, I_2, D, H, J_r, J_w, c, f_1, f_2, f_3, k, l, l_2, m, phi, psi, theta, u_phi, u_psi, v1, v2, v3
 
 import mechanics
 from mechanics import Mechanism
@@ -13,17 +14,6 @@ from mechanics.geometry.counting import count_operations
 from mechanics.geometry.reduction import derive
 
 FRAMES = [(name, frame) for name in mechanics.names() for frame in mechanics.get(name).frames]
-
-m, l, J_r, J_w, u_psi, u_phi = sp.symbols("m l J_r J_w u_psi u_phi")
-l_1, l_2, I_1, I_2 = sp.symbols("l_1 l_2 I_1 I_2")
-theta, psi, phi = sp.symbols("theta psi phi")
-v1, v2, v3 = sp.symbols("v1 v2 v3")
-D = m * l**2 - J_r * sp.sin(phi) ** 2
-c, H = l_2 + l_1 * sp.cos(psi), l_1 + l_2 * sp.cos(psi)
-k = l_2 * I_1 - l_1 * I_2 * sp.cos(psi)
-f_1 = m * c**2 + (I_1 + I_2) * sp.sin(psi) ** 2
-f_2 = m * l_2**2 * I_1 + m * l_1**2 * I_2 * sp.cos(psi) ** 2 + I_1 * I_2 * sp.sin(psi) ** 2
-f_3 = l_1 * I_2 - l_2 * I_1 * sp.cos(psi) + m * l_1 * l_2 * c
 
 
 def is_zero(expression):
