@@ -211,11 +211,24 @@ def to_sympy(text: str, symbols: Mapping[str, Any]) -> sp.Expr:
                     raise ExpressionError(f"in {_short(text)}: a power of degree beyond {MAX_DEGREE}")
             case _:
                 value = getattr(sp, {"abs": "Abs"}.get(operation, operation))(*parts)
+        if any(_is_root_of_a_root(factor) for factor in sp.Mul.make_args(value)):
+            raise ExpressionError(
+                f"in {_short(text)}: {operation!r} gives a root of a root there, or another power whose exponent is "
+                "neither an integer nor a half-integer; only such powers can be worked with"
+            )
         if value.is_number and value.has(*undefined):
             raise ExpressionError(f"in {_short(text)}: {operation!r} gives no real number there")
         return value
 
     return _fold(text, number, name, join)
+
+
+def _is_root_of_a_root(e: sp.Expr) -> bool:
+    """Whether this is a power beyond the half-integers, as it stands or once its base is multiplied out of it."""
+    if not (e.is_Pow and e.exp.is_Rational and e.exp.q > 1):
+        return False
+    factors = e.base.args if e.base.is_Mul else (e.base,)
+    return e.exp.q > 2 or any(f.is_Pow and f.exp.is_Rational and f.exp.q > 1 for f in factors)
 
 
 class Extent(NamedTuple):

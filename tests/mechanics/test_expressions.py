@@ -211,6 +211,21 @@ def test_numbers_and_symbols_mean_the_same(text, x, y):
     assert float(exact) == pytest.approx(number, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["sqrt(sqrt(x))", "sqrt(2*sqrt(y))", "(x*sqrt(1 + y**2))**0.5", "sqrt(x**1.5)", "sqrt(sqrt(2))", "exp(log(x)/3)"],
+)
+def test_roots_of_roots_are_refused_with_a_reason(text):
+    """Not so sums under a root: those have no power beyond the half-integers."""
+    x, y = sp.symbols("x y")
+    with pytest.raises(ExpressionError, match="root of a root") as error:
+        to_sympy(text, {"x": x, "y": y})
+    assert repr(text) in str(error.value)
+    assert to_sympy("sqrt(1 + sqrt(x)) + sqrt(x)*sqrt(y)", {"x": x, "y": y}) == sp.sqrt(1 + sp.sqrt(x)) + sp.sqrt(
+        x
+    ) * sp.sqrt(y)
+
+
 def test_lines_may_be_broken():
     x, y = sp.symbols("x y")
     assert to_sympy(" x +\n\ty\n", {"x": x, "y": y}) == x + y
