@@ -140,7 +140,8 @@ class Writer:
         if factor.LC < 0:
             # Half powers are of radicands only, whose printed form is the positive one of the two.
             return Product(Fraction(-1) ** int(exponent) if whole else Fraction(1)) * self._base(-factor, exponent)
-        if len(factor) == 1 and not factor.is_ground:  # a generator
+        # A generator; under a root, the sign of its form matters.
+        if len(factor) == 1 and sum(factor.LM) == 1 and (whole or factor not in self._forms):
             generator = self.algebra.generators[next(iter(factor)).index(1)]
             if generator in self.algebra.radicands:
                 return self._base(self.algebra.radicands[generator], exponent / 2)

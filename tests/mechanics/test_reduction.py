@@ -237,6 +237,23 @@ def test_every_function_of_the_language_is_differentiated(potential):
     agrees_with_multipliers(odd, reduce(odd))
 
 
+@pytest.mark.parametrize("radicand", ["a**2", "-a", "a*b", "-a*b", "a**3*b", "-cos(2*a)", "4*a**2*(1 + b**2)"])
+def test_roots_of_what_changes_sign(radicand):
+    """V = sqrt(R) and F = (1, 2 + sqrt(R)) over unit masses: Y = F and the rest is -grad V, where R is positive."""
+    coordinates = a, b = sp.symbols("a b")
+    data = {"name": "odd", "coordinates": ["a", "b"], "parameters": {}, "inertia": [["1", "0"], ["0", "1"]]}
+    force, potential = {"u": ["1", f"2 + sqrt({radicand})"]}, f"sqrt({radicand})"
+    e = reduce(Mechanism.from_dict(data | {"one_forms": [], "forces": force, "potential": potential}))
+    root = sp.sqrt(sp.sympify(radicand))
+    errors = [e.input_coefficients[1, 0] - 2 - root]
+    errors += [found + root.diff(q) for found, q in zip(e.potential_acceleration, coordinates, strict=True)]
+    corners = [{a: sp.Rational(9, 10) * i, b: sp.Rational(2, 5) * j} for i in (1, -1) for j in (1, -1)]
+    inside = [corner for corner in corners if root.subs(corner).is_real]
+    assert inside
+    # A few operations, worked out to 15 digits.
+    assert all(abs(error.subs(corner).evalf()) < 1e-12 for corner in inside for error in errors)
+
+
 @pytest.mark.parametrize(
     ("name", "frame", "most"),
     # A right-hand side written by hand takes 24 (snakeboard, flat) and 53 (racer). The bounds are what
