@@ -190,7 +190,8 @@ class Program:
         base |= {initial(state): state.name for state in flow.states}
         carried = carried or {}
         base |= {expression: given for given, expression in carried.items()}
-        start, end, errors = _Point("", {**base, TAU: "_h"}), {}, {}
+        start, end = _Point("", {**base, TAU: "_h"}), {}
+        errors: dict[sp.Symbol, str] = {}
         stages = [_Stage(self, body, flow, method, i, start) for i in range(method.stages)]
         for stage in stages:
             stage.others = stages
