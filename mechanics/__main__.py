@@ -1,11 +1,12 @@
 """Print the reduced equations of a mechanism: `python -m mechanics snakeboard --frame paper`.
 
 `python -m mechanics FILE.toml` does the same for a mechanism of your own (`Mechanism.from_file`),
-and `python -m mechanics` lists the catalogue.
+`python -m mechanics` lists the catalogue, and `--scene ID` shows what an environment computes of it.
 """
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -40,6 +41,7 @@ def main(
     frame: str | None = None,
     drag: bool = False,
     shorthands: bool = True,
+    scene: str = "",
 ) -> None:
     """Derive and print the equations of motion of a mechanism.
 
@@ -49,7 +51,13 @@ def main(
         frame: name of one of its frames; the default frame if left out.
         drag: let the mechanism's drag act.
         shorthands: write the mechanism's own shorthands (such as f_1) instead of what they stand for.
+        scene: id of an environment, such as nhenv/SnakeboardForward-v0: print which states it integrates, which it
+            leaves out, and the operations of a step, as `python -m nhenv` does; nothing else is needed then.
     """
+    if scene:
+        # A command line may look upward, at run time and when asked; nothing of this package does.
+        importlib.import_module("nhenv.__main__").main((scene,), drag=drag)
+        return
     if not name:
         print("\n".join(catalogue()))
         return
