@@ -61,7 +61,7 @@ look_row: Any = None  # (p, j, numbers, observation): observe
 held_numbers: Any = None  # (p, j, numbers, limits) -> constants; write the stops to `limits`
 
 
-MAX_SWEEPS = 12  # Newton's method from a cubic needs two or three
+MAX_SWEEPS = 12  # Halley's method from a cubic needs two
 MAX_ROUNDS = 16  # more are not worth a place for every row of the block
 
 # What comes of a row's free flight: it may have met a stop; it is not right.

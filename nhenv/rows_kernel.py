@@ -440,7 +440,8 @@ class RowsKernel(Generator):
                     f"over = side*angle - stop_{name}",
                     "value = -side*rate if turning else over",
                     "slope = -side*motion[1] if turning else side*motion[0]",
-                    "better, low_, high_ = refine(trial, low, high, value, slope, end)",
+                    "bend = 0.0 if turning else side*motion[1]",
+                    "better, low_, high_ = refine(trial, low, high, value, slope, bend, end)",
                     "found = better == trial",
                     # Where it turned: beyond the stop, so look for the crossing before; or it never got there.
                     "beyond, missed = turning & found & (over > 0.0), turning & found & (over <= 0.0)",

@@ -141,32 +141,32 @@ def zero(
 ) -> float:
     """Time in (0, end] at which sign times a value of joint j passes `level` upward; `kind` says which value.
 
-    Newton's method, kept in a bracket by bisection, which alone serves a push. `new` holds the state at `end` on entry,
+    Halley's method, kept in a bracket by bisection, which alone serves a push. `new` holds the state at `end` on entry,
     and for an angle or a rate the state at the time returned on leaving. A push has just passed at that time.
     """
     low, high = 0.0, end
     motion(new, control, k, work)
-    above, rate_above = value_of(j, kind, new, work)
+    above, rate_above, _ = value_of(j, kind, new, work)
     motion(state, control, k, work)
-    below, rate_below = value_of(j, kind, state, work)
+    below, rate_below, _ = value_of(j, kind, state, work)
     time = guess(sign * below - level, sign * above - level, sign * rate_below, sign * rate_above, end)
     for _ in range(MAX_ITERATIONS):
         advance(time, state, control, free, k, new)
         motion(new, control, k, work)
-        value, rate = value_of(j, kind, new, work)
-        better, low, high = refine(time, low, high, sign * value - level, sign * rate, end)
+        value, rate, bend = value_of(j, kind, new, work)
+        better, low, high = refine(time, low, high, sign * value - level, sign * rate, sign * bend, end)
         if better == time:
             break
         time = better
     return high if kind == PUSH else time
 
 
-def value_of(j: int, kind: int, state: Array, work: Array) -> tuple[float, float]:
-    """What `zero` watches, in a state whose `motion` is in `work`, and its rate, 0 where that is not known."""
+def value_of(j: int, kind: int, state: Array, work: Array) -> tuple[float, float, float]:
+    """What `zero` watches, in a state whose `motion` is in `work`, and its first two derivatives, 0 if not known."""
     push = work[len(ANGLES) + j]
     if kind == ANGLE:
-        return state[ANGLES[j]], work[j]
-    return (state[RATES[j]], push) if kind == RATE else (push, 0.0)
+        return state[ANGLES[j]], work[j], push
+    return (state[RATES[j]], push, 0.0) if kind == RATE else (push, 0.0, 0.0)
 
 
 def guess(below: float, above: float, rate: float, rate_above: float, end: float) -> float:
@@ -192,13 +192,17 @@ def guess(below: float, above: float, rate: float, rate_above: float, end: float
     return time
 
 
-def refine(time: float, low: float, high: float, value: float, rate: float, end: float) -> tuple[float, float, float]:
-    """Newton's step from `time`, where what passes zero in (low, high) is `value`, at `rate`; and the new bracket.
+def refine(
+    time: float, low: float, high: float, value: float, rate: float, bend: float, end: float
+) -> tuple[float, float, float]:
+    """Halley's step from `time`, where what passes zero in (low, high) is `value`, at `rate`; and the new bracket.
 
-    By bisection where Newton's step leaves the bracket; no step where there is nothing left to gain.
+    `bend` is the second derivative, or 0: then the step is Newton's. By bisection where the step leaves the bracket; no
+    step where there is nothing left to gain.
     """
     low, high = (low, time) if value > 0.0 else (time, high)
-    step = value / rate if rate > 0.0 else inf
+    slope = rate - 0.5 * value * bend / rate
+    step = value / (slope if slope > 0.0 else rate) if rate > 0.0 else inf
     better = time - step
     if not ((low < better) & (better < high)):
         better = 0.5 * (low + high)
