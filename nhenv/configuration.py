@@ -212,9 +212,9 @@ def _tolerance(given: float | None, integrator: str) -> float:
         raise ValueError(
             f"tolerance must be at least {SMALLEST_TOLERANCE}, because of roundings, and below 1, got {given!r}"
         )
-    if integrator != "auto" and method(integrator).stages == 1:
-        raise ValueError(
-            f"tolerance={given!r} needs an estimate of the error, and integrator {integrator!r} has too few stages for "
-            "one; choose another, or tolerance=None"
-        )
+    if integrator != "auto":
+        try:
+            method(integrator).estimates  # noqa: B018 (it says what is wrong with the method)
+        except ValueError as error:
+            raise ValueError(f"tolerance={given!r}: {error}, or tolerance=None") from None
     return number

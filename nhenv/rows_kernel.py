@@ -546,7 +546,7 @@ class RowsKernel(Generator):
             lines += [
                 f"_at = fabs({a}) >= {stop}",
                 f"{a} = copysign({stop}, {a}) if _at else {a}",
-                f"_pressed = _at & ({v}*{a} >= 0.0)",
+                f"_pressed = _at & ({v}*{a} >= -AT_REST)",
                 f"{v} = 0.0 if _pressed else {v}",
                 f"_push = move_joints({_listed(states)}{_listed(controls)}_k)[{len(self.joints) + j}]",
                 f"{free} = 0.0 if _pressed & (_push*{a} >= 0.0) else 1.0",

@@ -191,37 +191,40 @@ class Program:
         carried = carried or {}
         base |= {expression: given for given, expression in carried.items()}
         start, end = _Point("", {**base, TAU: "_h"}), {}
-        errors: dict[sp.Symbol, str] = {}
+        errors: dict[tuple[sp.Symbol, int], str] = {}
         stages = [_Stage(self, body, flow, method, i, start) for i in range(method.stages)]
         for stage in stages:
             stage.others = stages
         integrated_states = [state for state in flow.states if state not in flow.solutions]
         estimated = integrated_states if tolerance < inf else []
-        doubts = method.estimate[0] if estimated else [0.0] * method.stages
+        doubts = [weights for weights, _ in method.estimates] if estimated else []
         for state in flow.solutions:
             end[state] = body.polynomial(state, "_h", start)
         if method.explicit:
             end |= {state: state.name for state in integrated_states}
-            for stage, weight, doubt in zip(stages, method.b, doubts, strict=True):
+            for i, (stage, weight) in enumerate(zip(stages, method.b, strict=True)):
                 for state in integrated_states:
                     rate = stage.rate(state)
                     if weight:  # summed up on the way, lest all rates be kept until the end
                         total = backend.sum_of_products([(repr(weight), rate)], end[state])
                         end[state] = body.assign(f"_e_{state.name}{stage.suffix}", total)
-                    if doubt:
-                        total = backend.sum_of_products([(repr(doubt), rate)], errors.get(state, ""))
-                        errors[state] = body.assign(f"_d_{state.name}{stage.suffix}", total)
+                    for which, weights in enumerate(doubts):
+                        if weights[i]:
+                            total = backend.sum_of_products([(repr(weights[i]), rate)], errors.get((state, which), ""))
+                            errors[state, which] = body.assign(f"_d{which}_{state.name}{stage.suffix}", total)
         else:  # layer after layer
             for state in integrated_states:
                 total = body.moved(state.name, method.b, stages, methodcaller("rate", state))
                 end[state] = body.assign(f"_e_{state.name}", total)
-            for state in estimated:
-                errors[state] = body.moved("", doubts, stages, methodcaller("rate", state))
+            for which, weights in enumerate(doubts):
+                for state in estimated:
+                    errors[state, which] = body.moved("", weights, stages, methodcaller("rate", state))
         right = ["_right"] * (substeps > 1)
         if estimated:
-            limit = repr(method.threshold(tolerance))
-            bounds = {s: backend.sum_of_products([(limit, f"fabs({end[s]})")], limit) for s in estimated}
-            right += [f"(fabs({errors[state]}) <= {bound})" for state, bound in bounds.items()]
+            limits = list(map(repr, method.thresholds(tolerance)))
+            for (state, which), error in errors.items():
+                bound = backend.sum_of_products([(limits[which], f"fabs({end[state]})")], limits[which])
+                right.append(f"(fabs({error}) <= {bound})")
             right += [f"(fabs({end[a]} - {a.name}) <= {LARGEST_TURN!r})" for a in self._turning(flow)]
         names = [state.name for state in flow.states]
         arguments = ["_h", *names, *carried, *(symbol.name for symbol in held)]

@@ -38,10 +38,12 @@ SHORTEST = 2.0**-24  # flight, of the hold
 MAX_ITERATIONS = 100  # bisection alone needs 53
 TIME_TOLERANCE = 1e-13  # of the hold: at 100 rad/s and 0.05 s, the angle is right to 5e-13 rad
 
+AT_REST = 1e-12  # rad^2/s: a joint on its stop that leaves it no faster does not move, but for roundings
+
 # What passes a level: a joint's angle, its rate, or the acceleration that it would have if it were not held.
 ANGLE, RATE, PUSH = 0, 1, 2
 
-CONSTANTS = ("MAX_FLIGHTS", "SHORTEST", "MAX_ITERATIONS", "TIME_TOLERANCE", "ANGLE", "RATE", "PUSH")
+CONSTANTS = ("MAX_FLIGHTS", "SHORTEST", "MAX_ITERATIONS", "TIME_TOLERANCE", "AT_REST", "ANGLE", "RATE", "PUSH")
 
 
 def hold(
@@ -82,7 +84,7 @@ def settle(state: Array, control: Array, k: Array, limits: Array, free: Array, w
         angle = state[ANGLES[j]]
         if abs(angle) >= limits[j]:
             state[ANGLES[j]] = copysign(limits[j], angle)
-            if state[RATES[j]] * angle >= 0.0:
+            if state[RATES[j]] * angle >= -AT_REST:
                 state[RATES[j]] = 0.0
                 motion(state, control, k, work)
                 if work[len(ANGLES) + j] * angle >= 0.0:
