@@ -217,21 +217,35 @@ class Mechanism:
                 result[..., i, j] = evaluate(text, scope)
         return result[..., 0, :] if single else result
 
-    def drag_coefficients(self, drag: bool | Mapping[str, float] | None) -> dict[str, float]:
-        """Coefficients of the drag that acts: none, the defaults (True), or those with some replaced."""
-        if drag is None or drag is False:
-            return {}
-        values = {name: float(value) for name, value in self.drag.items()}
-        if self.rayleigh == "0":
-            raise MechanismError(f"{self.name} has no drag: it declares no Rayleigh function")
-        if drag is not True and not isinstance(drag, Mapping):
+    def drag_coefficients(self, drag: bool | Mapping[str, float] | None) -> dict[str, float] | None:
+        """Coefficients of the drag that acts, or None if none does: here, and nowhere else, this is decided.
+
+        Args:
+            drag: None or False for none, True for the defaults, or coefficients by name that replace some of them.
+
+        Raises:
+            MechanismError: the mechanism has no drag, or a coefficient is misspelt, negative or not a finite number.
+        """
+        if drag is None or (isinstance(drag, bool | np.bool_) and not drag):
+            return None
+        if not isinstance(drag, bool | np.bool_ | Mapping):
             raise MechanismError(f"{self.name}: drag must be True, False or coefficients by name, got {drag!r}")
-        for name, value in {} if drag is True else drag.items():
+        if self.rayleigh == "0":
+            raise MechanismError(
+                f"{self.name} has no drag: it declares no Rayleigh function (rayleigh, and drag for its coefficients), "
+                f"as these do: {', '.join(_with_drag())}"
+            )
+        values = {name: float(value) for name, value in self.drag.items()}
+        for name, value in drag.items() if isinstance(drag, Mapping) else ():
             if name not in values:
                 raise MechanismError(f"{self.name}: {unknown_name('drag coefficient', str(name), values)}")
             values[name] = specs.number(value, f"{self.name}: drag coefficient {name}")
         self._check_coefficients(values)
         return values
+
+    def without_drag(self) -> Mechanism:
+        """The same mechanism, as if no drag were known of it."""
+        return self if self.rayleigh == "0" else dataclasses.replace(self, rayleigh="0", drag={})
 
     @property
     def rates(self) -> tuple[str, ...]:
@@ -487,6 +501,13 @@ class Mechanism:
         factors = np.random.default_rng(1).uniform(0.9, 1.1, (SAMPLES, len(self.parameters))).T
         values = (value * factor for value, factor in zip(self.parameters.values(), factors, strict=True))
         return {**dict(zip(self.parameters, values, strict=True)), **self._sample_configurations()}
+
+
+def _with_drag() -> list[str]:
+    """Names of the mechanisms of the catalogue that declare drag."""
+    from mechanics.catalog import get, names  # which is made of mechanisms
+
+    return [name for name in names() if get(name).rayleigh != "0"]
 
 
 def _unit_rows(matrices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

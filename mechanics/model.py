@@ -47,11 +47,11 @@ class Model:
         self.mechanism = mechanism
         self.params = mechanism.resolve(params)
         rows = mechanism.frame_rows(frame)
-        coefficients = mechanism.drag_coefficients(drag)
-        acts = drag is not None and drag is not False
+        self.drag = mechanism.drag_coefficients(drag)
+        acts = self.drag is not None
         specification = {"mechanism": mechanism.to_dict(), "frame": rows, "drag": acts}
         self._functions = kernels.load(f"{mechanism.name}_model", specification, lambda: _source(mechanism, rows, acts))
-        self._constants = np.array(self._functions.constants([*self.params.values(), *coefficients.values()]))
+        self._constants = np.array(self._functions.constants([*self.params.values(), *(self.drag or {}).values()]))
 
     def project(self, q: ArrayLike, qdot: ArrayLike) -> Array:
         """Pseudo-velocities v (..., k) of velocities q̇ (..., n), orthogonally projected onto D."""

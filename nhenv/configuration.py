@@ -35,6 +35,7 @@ class Configuration:
         mechanism: what moves.
         task: what for.
         params: name -> value.
+        drag: name -> coefficient of the drag that acts; None if none does.
         dt: control period in s.
         torque_limits: (m,) largest torques.
         joint_limits: name -> angle.
@@ -49,6 +50,7 @@ class Configuration:
         task: TaskLike = "Forward",
         *,
         params: Mapping[str, float] | None = None,
+        drag: bool | Mapping[str, float] | None = None,
         dt: float = 0.05,
         torque_limits: Mapping[str, float] | ArrayLike | None = None,
         joint_limits: bool | Mapping[str, float] = True,
@@ -71,6 +73,7 @@ class Configuration:
         if problem := unfit(self.mechanism, self.task):
             raise ValueError(problem)
         self.params = self.mechanism.resolve(params)
+        self.drag = self.mechanism.drag_coefficients(drag)
         self.dt = checks.positive("dt", dt)
         self.torque_limits = self._torque_limits(torque_limits)
         self.joint_limits = self._joint_limits(joint_limits)
@@ -81,28 +84,29 @@ class Configuration:
             self.task,
             frame=frame,
             stops=bool(self.joint_limits),
+            drag=self.drag is not None,
             integrator=integrator,
             substeps=None if substeps is None else checks.whole("substeps", substeps),
             tolerance=_tolerance(tolerance, integrator),
             backend=backend,
             whole_state=bool(whole_state),
         )
-        self.numbers(self.params)  # refuses parameters with which the mechanism has no forward
+        self.numbers(self.params, self.drag)  # refuses parameters with which the mechanism has no forward
 
-    def numbers(self, params: Mapping[str, float]) -> dict[str, float]:
-        """A value for each of the scene's parameters, for these parameters of the mechanism."""
+    def numbers(self, params: Mapping[str, float], drag: Mapping[str, float] | None) -> dict[str, float]:
+        """A value for each of the scene's parameters, for these parameters and drag coefficients of the mechanism."""
         forward = float(np.sign(evaluate(self.mechanism.forward, params)))
         if forward == 0:
             raise ValueError(
                 f"{self.mechanism.name}: with these parameters {self.mechanism.forward} = 0, and its gaits drive it "
                 "neither way; change a parameter"
             )
-        return {**self.weights, **params, "dt": self.dt, "forward": forward}
+        return {**self.weights, **params, "dt": self.dt, "forward": forward, **(drag or {})}
 
     @cached_property
     def model(self) -> Model:
-        """The mechanism's functions in the scene's frame."""
-        return Model(self.mechanism, self.params, self.scene.frame)
+        """The mechanism's functions in the scene's frame, with the drag that acts."""
+        return Model(self.mechanism, self.params, self.scene.frame, self.drag)
 
     @property
     def action_space(self) -> gym.Space[NDArray[np.float32]]:

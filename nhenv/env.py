@@ -120,6 +120,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         mechanism: a `Mechanism`, the name of one in the catalogue, its plain data or the path of its file.
         task: a `Task`, the name of one, or its plain data.
         params: values that replace the mechanism's default parameters, by name.
+        drag: None or False for none, True for the mechanism's own drag at wheels and joints, or coefficients by name
+            that replace some of its defaults, such as {"C": 0.5}; as in `mechanics.simulate`.
         dt: control period in s.
         torque_limits: largest torques in N m: by name, or one for each control.
         joint_limits: True for the mechanism's own stops, False for none, or angles in rad by name.
@@ -149,7 +151,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __init__(self, mechanism: MechanismLike, task: TaskLike = "Forward", **arguments: Any) -> None:
         self._configuration = configuration = Configuration(mechanism, task, **arguments)
         self.mechanism, self.task = configuration.mechanism, configuration.task
-        self.params, self.dt = configuration.params, configuration.dt
+        self.params, self.drag, self.dt = configuration.params, configuration.drag, configuration.dt
         self.torque_limits, self.joint_limits = configuration.torque_limits, configuration.joint_limits
         self.reset_noise_scale, self.frame = configuration.reset_noise_scale, configuration.scene.frame
         self._scene = configuration.scene
@@ -277,7 +279,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._bind()
 
     def _new_memory(self, scene: Scene) -> Array:
-        numbers = self._configuration.numbers(self.params)
+        numbers = self._configuration.numbers(self.params, self.drag)
         return scene.new_memory(numbers, self.torque_limits, self.joint_limits.values())
 
     def _constants(self, memory: Array) -> Array:

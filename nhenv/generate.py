@@ -41,7 +41,7 @@ class Generator:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.equations = equations = derive(scene.mechanism, scene.frame)
+        self.equations = equations = derive(scene.mechanism, scene.frame, drag=scene.drag)
         self.backend = BACKENDS[scene.backend]
         self.actions = [sp.Symbol(f"_a_{control}") for control in scene.mechanism.controls]
         self.joints = [_joint(equations, name) for name in scene.joints]
@@ -313,7 +313,7 @@ def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) 
         scope |= roles
     words = (*task.weights, *task.targets, *task.definitions) if task else ()
     for name in (*words, "dt", "forward", "effort", "terminated"):
-        if name in mechanism.coordinates or name in mechanism.parameters:
+        if name in (*mechanism.coordinates, *mechanism.parameters, *mechanism.drag):
             raise ExpressionError(f"{mechanism.name} has its own {name!r}, a word that tasks use; rename it")
     return scope | {name: sp.Symbol(name) for name in (task.targets if task else ())}
 

@@ -55,6 +55,7 @@ class Scene:
         task: what it is for; None for a scene that only integrates the whole state.
         frame: frame in which the reduced equations are integrated; None for the default.
         stops: whether joint limits act.
+        drag: whether the mechanism's drag acts; if not, the kernel is that of a mechanism without any.
         integrator: name of a method, or "auto".
         substeps: steps of the method in a hold; None for the default.
         tolerance: what no flight may get wrong by the method's own estimate, of a state z in (1 + |z|); a hold is
@@ -67,6 +68,7 @@ class Scene:
     task: Task | None
     frame: str | None = None
     stops: bool = True
+    drag: bool = False
     integrator: str = "auto"
     substeps: int | None = None
     tolerance: float = math.inf
@@ -84,7 +86,8 @@ class Scene:
     def parameters(self) -> tuple[str, ...]:
         """Names of the numbers that `constants` of the kernel takes, in order."""
         weights = self.task.weights if self.task else ()
-        return (*self.mechanism.parameters, *weights, "dt", "forward")
+        drag = self.mechanism.drag if self.drag else ()
+        return (*self.mechanism.parameters, *weights, "dt", "forward", *drag)
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -178,10 +181,12 @@ class Scene:
 
     def source(self, kind: str = "one") -> str:
         """Derive the source of a kernel, "one", "rows" or "varied"; called when the cache has none."""
+        # What does not act leaves no trace: not in symmetries, not in what is observed by default.
+        scene = self if self.drag else dataclasses.replace(self, mechanism=self.mechanism.without_drag())
         if kind == "one":
             from nhenv.one_kernel import OneKernel
 
-            return OneKernel(self).module()
+            return OneKernel(scene).module()
         from nhenv.rows_kernel import RowsKernel
 
-        return RowsKernel(self, varied=kind == "varied").module()
+        return RowsKernel(scene, varied=kind == "varied").module()

@@ -78,6 +78,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         info: "none", "final" or "all".
         threads: how many threads share the rows. More than one pays from some 10,000 rows on.
         params: as for `LocomotionEnv`; a value may be an array (N,), one for each row.
+        drag: as for `LocomotionEnv`; a coefficient may be an array (N,).
         torque_limits: as for `LocomotionEnv`; by name, a value may be an array (N,).
         **arguments: the other arguments of `LocomotionEnv`, the same for all rows. Without `whole_state=True`,
             coordinates that nothing depends on are not followed, and are NaN in `q`.
@@ -98,6 +99,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         info: str = "none",
         threads: int = 1,
         params: Mapping[str, ArrayLike] | None = None,
+        drag: bool | Mapping[str, ArrayLike] | None = None,
         torque_limits: Mapping[str, ArrayLike] | ArrayLike | None = None,
         **arguments: Any,
     ) -> None:
@@ -107,23 +109,26 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         self.threads = checks.whole("threads", threads)
         self.autoreset_mode = vector_input.autoreset_mode(autoreset_mode)
         self.info = vector_input.info_level(info)
-        own_params, own_limits = vector_input.arrays("params", params or {}, size), {}
+        own_params = vector_input.arrays("params", params or {}, size)
+        own_drag = vector_input.arrays("drag", drag, size) if isinstance(drag, Mapping) else {}
+        own_limits: dict[str, Array] = {}
         if isinstance(torque_limits, Mapping):
             own_limits = vector_input.arrays("torque_limits", torque_limits, size)
-            torque_limits = {**torque_limits, **{name: values[0] for name, values in own_limits.items()}}
+            torque_limits = vector_input.first(torque_limits, own_limits)
         # What is made of the first row's numbers serves for all, or checks what they have in common.
         self._configuration = configuration = Configuration(
             mechanism,
             task,
-            params={**(params or {}), **{name: float(values[0]) for name, values in own_params.items()}},  # type: ignore[dict-item]
-            torque_limits=torque_limits,  # type: ignore[arg-type]
+            params=vector_input.first(params or {}, own_params),
+            drag=vector_input.first(drag, own_drag) if isinstance(drag, Mapping) else drag,
+            torque_limits=torque_limits,
             **arguments,
         )
         self.mechanism, self.task = configuration.mechanism, configuration.task
         self.dt, self.joint_limits = configuration.dt, configuration.joint_limits
         self.reset_noise_scale, self.frame = configuration.reset_noise_scale, configuration.scene.frame
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self._parameters = RowParameters(configuration, size, varied=bool(own_params or own_limits))
+        self._parameters = RowParameters(configuration, size, varied=bool(own_params or own_drag or own_limits))
         kernel = self._kernel
         self._observed = (size, len(kernel.OBSERVATION))
         self.single_action_space = configuration.action_space
@@ -137,7 +142,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         self._numbers = self._shared_numbers()
         self._step_info = StepInfo(info, self.autoreset_mode, kernel, size)
         if self._parameters.varied:
-            self._parameters.change(own_params, own_limits, np.arange(size), kernel, self._memory)
+            self._parameters.change(own_params, own_drag, own_limits, np.arange(size), kernel, self._memory)
         self._seeded = self._started = False
         self._bind()
 
@@ -212,7 +217,12 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by name: a number, or an array (N,) where rows differ."""
-        return {name: np.copy(value) if np.ndim(value) else value for name, value in self._parameters.values.items()}
+        return _copied(self._parameters.values)
+
+    @property
+    def drag(self) -> dict[str, Any] | None:
+        """Coefficients of the drag that acts, by name: a number, or an array (N,) where rows differ; None if none."""
+        return None if self._parameters.drag is None else _copied(self._parameters.drag)
 
     @property
     def torque_limits(self) -> Array:
@@ -267,22 +277,28 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         params: Mapping[str, ArrayLike] | None = None,
         torque_limits: Mapping[str, ArrayLike] | None = None,
         mask: Bools | None = None,
+        *,
+        drag: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Give rows other parameters; nothing is compiled, and states (q, v) stay as they are.
 
         Args:
             params: name -> a number, or an array (N,).
             torque_limits: the same for the largest torques.
-            mask: rows, shape (N,); None for all. Only an environment that was made with an array in `params` or
+            mask: rows, shape (N,); None for all. Only an environment that was made with an array in `params`, `drag` or
                 `torque_limits` has parameters for each row.
+            drag: the same for the coefficients of the drag, in an environment that was made with drag.
         """
         if not self._parameters.varied:
             raise ValueError(
                 "all rows share their parameters: make the environment with an array for at least one of them, such as "
                 f"params={{{next(iter(self._parameters.values))!r}: np.full(num_envs, ...)}}"
             )
+        if drag is not None and not isinstance(drag, Mapping):
+            raise ValueError(f"drag must be coefficients by name, got {drag!r}: whether drag acts cannot change")
         self._parameters.change(
             vector_input.arrays("params", params or {}, self.num_envs, numbers=True),
+            vector_input.arrays("drag", drag or {}, self.num_envs, numbers=True),
             vector_input.arrays("torque_limits", torque_limits or {}, self.num_envs, numbers=True),
             np.flatnonzero(vector_input.mask("mask", mask, self.num_envs)),
             self._kernel,
@@ -330,7 +346,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         shared += [np.nan] * len(self.task.targets)
         if self._parameters.varied:
             return np.array(shared, float)
-        numbers = configuration.numbers(configuration.params)
+        numbers = configuration.numbers(configuration.params, configuration.drag)
         constants = kernel.constants([numbers[name] for name in configuration.scene.parameters])
         stops = configuration.joint_limits.values()
         return np.array([*constants, *configuration.torque_limits, *stops, *shared], float)
@@ -404,6 +420,11 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         if not self._step_info.due(events):
             return {}
         return self._step_info.of_step(events, done, self._memory["steps__p"] == 0, self.targets)
+
+
+def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers, and copies of arrays."""
+    return {name: np.copy(value) if np.ndim(value) else value for name, value in values.items()}
 
 
 def _refuse(*arguments: Any) -> int:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.expressions import unknown_name
 
-__all__ = ["FLOATS", "Seeds", "actions", "arrays", "autoreset_mode", "info_level", "mask", "seeds"]
+__all__ = ["FLOATS", "Seeds", "actions", "arrays", "autoreset_mode", "first", "info_level", "mask", "seeds"]
 
 Seeds = int | Sequence[int | None] | None
 
@@ -53,6 +53,11 @@ def arrays(
         if array.shape or numbers:
             found[str(name)] = np.array(np.broadcast_to(array, size))
     return found
+
+
+def first(given: Mapping[str, Any], arrays: Mapping[str, NDArray[np.float64]]) -> dict[str, Any]:
+    """What is given, with the first row's number in place of arrays."""
+    return {**given, **{name: float(values[0]) for name, values in arrays.items()}}
 
 
 def mask(what: str, given: NDArray[np.bool_] | None, size: int) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Parameters and torque limits of rows, alike or each with its own."""
+"""Parameters, drag and torque limits of rows, alike or each with its own."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Rows = NDArray[np.int64]  # numbers of rows
 
 
 class RowParameters:
-    """Parameters and torque limits of N rows; at first those of a configuration.
+    """Parameters, drag and torque limits of N rows; at first those of a configuration.
 
     Args:
         configuration: what the rows have in common.
@@ -31,17 +31,20 @@ class RowParameters:
     Attributes:
         varied: as given.
         values: name -> a number, or an array (N,) where rows differ.
+        drag: name -> coefficient, likewise; None if no drag acts.
         torque_limits: (N, m) largest torques.
     """
 
     def __init__(self, configuration: Configuration, size: int, varied: bool) -> None:
         self._configuration, self.varied = configuration, varied
         self.values: dict[str, Any] = dict(configuration.params)
+        self.drag: dict[str, Any] | None = None if configuration.drag is None else dict(configuration.drag)
         self.torque_limits = np.tile(configuration.torque_limits, (size, 1))
 
     def change(
         self,
         params: Mapping[str, Array],
+        drag: Mapping[str, Array],
         limits: Mapping[str, Array],
         chosen: Rows,
         kernel: ModuleType,
@@ -56,17 +59,18 @@ class RowParameters:
             if not (np.isfinite(values[chosen]) & (values[chosen] > 0)).all():
                 raise ValueError(f"torque_limits: those of {name} must be positive and finite, got {values[chosen]}")
             torque_limits[chosen, controls.index(name)] = values[chosen]
-        new = dict(self.values)
-        for name, values in params.items():
-            if name not in new:
-                raise ValueError(f"params: {unknown_name('parameter', name, new)}")
-            new[name] = np.array(np.broadcast_to(new[name], len(torque_limits)))
-            new[name][chosen] = values[chosen]
+        if drag and self.drag is None:
+            raise ValueError(
+                f"drag: these environments have none, so {', '.join(drag)} cannot change: make them with drag=True"
+            )
+        new = self._merged("params", "parameter", self.values, params, chosen)
+        new_drag = None if self.drag is None else self._merged("drag", "drag coefficient", self.drag, drag, chosen)
         fields = [name for name in kernel.LASTING if name.startswith("k_")]
         constants = np.empty((len(chosen), len(fields)))
         for place, row in enumerate(chosen.tolist()):
             try:
-                numbers = configuration.numbers(configuration.mechanism.resolve(_row(new, row)))
+                of_row = configuration.mechanism.drag_coefficients(_row(new_drag, row))
+                numbers = configuration.numbers(configuration.mechanism.resolve(_row(new, row)), of_row)
             except ValueError as error:
                 raise type(error)(f"row {row}: {error}") from None
             constants[place] = kernel.constants([numbers[name] for name in configuration.scene.parameters])
@@ -76,17 +80,33 @@ class RowParameters:
             memory.put(f"limit_{control}__p", chosen, torque_limits[chosen, i])
         for joint, limit in configuration.joint_limits.items():
             memory.put(f"stop_{joint}__p", chosen, limit)
-        self.values, self.torque_limits = new, torque_limits
+        self.values, self.drag, self.torque_limits = new, new_drag, torque_limits
+
+    def _merged(
+        self, what: str, kind: str, old: Mapping[str, Any], given: Mapping[str, Array], chosen: Rows
+    ) -> dict[str, Any]:
+        """Numbers by name, those given put in for the chosen rows."""
+        new = dict(old)
+        for name, values in given.items():
+            if name not in new:
+                raise ValueError(f"{what}: {unknown_name(kind, name, new)}")
+            new[name] = np.array(np.broadcast_to(new[name], len(self.torque_limits)))
+            new[name][chosen] = values[chosen]
+        return new
 
     def evaluate(self, function: str, q: Array, other: Array, chosen: Rows) -> Array:
         """A function of the mechanism's model, of q and v or q̇ in the chosen rows."""
         if not self.varied:
             return getattr(self._configuration.model, function)(q, other)
         mechanism, frame = self._configuration.mechanism, self._configuration.scene.frame
-        models = (Model(mechanism, _row(self.values, row), frame) for row in chosen.tolist())
+        models = (Model(mechanism, _row(self.values, row), frame, _row(self.drag, row)) for row in chosen.tolist())
         return np.array([getattr(model, function)(*of_row) for model, *of_row in zip(models, q, other, strict=True)])
 
 
-def _row(values: Mapping[str, Any], row: int) -> dict[str, float]:
-    """Numbers of one row, of numbers or arrays (N,)."""
-    return {name: float(value[row]) if np.ndim(value) else value for name, value in values.items()}
+def _row(values: Mapping[str, Any] | None, row: int) -> dict[str, float] | None:
+    """Numbers of one row, of numbers or arrays (N,); None of None."""
+    return (
+        None
+        if values is None
+        else {name: float(value[row]) if np.ndim(value) else value for name, value in values.items()}
+    )

@@ -44,6 +44,7 @@ class Compare:
         env_ids: environments.
         seeds: numbers of the PPO runs on each.
         timesteps: environment steps of a PPO run; None for the settings of the task.
+        drag: let the mechanisms' drag act.
         out: folder of the results. What is finished in it is used again if its settings are the same.
         processes: processes side by side.
         quick: far too short runs, to see that everything works.
@@ -52,6 +53,7 @@ class Compare:
     env_ids: tuple[str, ...] = settings_of.COMPARED
     seeds: tuple[int, ...] = (0, 1, 2)
     timesteps: int | None = None
+    drag: bool = False
     out: Path = Path("runs/compare")
     processes: int = os.cpu_count() or 1
     quick: bool = False
@@ -71,6 +73,8 @@ class Compare:
         config = settings_of.for_env(env_id)
         if self.quick:
             config = settings_of.quick(config)
+        if self.drag:
+            config = settings_of.within(config, drag=True)
         if self.timesteps is not None:
             config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, timesteps=self.timesteps))
         return config
@@ -121,7 +125,8 @@ def judge(env_id: str, options: Compare) -> dict[str, Any]:
     for label, gait in config.gaits.items():
         path = gait_path(env_id, gait, out)
         tuned = read_json(path)["result"]
-        episodes, gaits[label] = _judged(sinusoid(envs, gait, tuned["vector"]), env_id, config, path, tuned)
+        controller = sinusoid(make_envs(env_id, 1, **gait.env_kwargs), gait, tuned["vector"])
+        episodes, gaits[label] = _judged(controller, env_id, config, path, tuned)
         shown.append(Shown(label, GAITS[len(shown)], episodes))
     for seed in options.seeds:
         path = ppo_path(env_id, config.ppo, seed, out)

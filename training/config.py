@@ -27,6 +27,7 @@ __all__ = [
     "quick",
     "task_name",
     "training_seed",
+    "within",
 ]
 
 # Three ranges of environment seeds that never meet: nobody is judged on starts that it was fitted to.
@@ -40,6 +41,7 @@ class GaitConfig:
     """Tuning of a sinusoidal gait by differential evolution.
 
     Attributes:
+        env_kwargs: arguments of the environment in which it is tuned, as plain data, such as {"drag": True}.
         steered: whether amplitudes and frequency change over the episode, and the heading is fed back.
         cyclic_ratio: frequency of the joints without stops over that of the joints with stops.
         frequency: smallest and largest angular frequency of the joints with stops, rad/s.
@@ -52,6 +54,7 @@ class GaitConfig:
         seed: seed of the search.
     """
 
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
     steered: bool = False
     cyclic_ratio: float = 1.0
     frequency: tuple[float, float] = (1.0, 30.0)
@@ -69,6 +72,7 @@ class PPOConfig:
     """PPO with Stable-Baselines3.
 
     Attributes:
+        env_kwargs: arguments of the environment in which it learns, as plain data.
         timesteps: environment steps of a run, over all environments.
         n_envs: environments side by side.
         n_steps: steps of each environment between updates. The number of updates counts, not of steps.
@@ -86,6 +90,7 @@ class PPOConfig:
         checkpoint_every: updates between two checkpoints.
     """
 
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
     timesteps: int = 3_000_000
     n_envs: int = 64
     n_steps: int = 64
@@ -108,10 +113,12 @@ class EvaluationConfig:
     """How a finished controller is judged.
 
     Attributes:
+        env_kwargs: arguments of the environment in which it is judged, as plain data.
         episodes: episodes, the same starts for every controller.
         fine_substeps: steps of the integrator in a hold for a second opinion, so that none wins on its error.
     """
 
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
     episodes: int = 100
     fine_substeps: int = 10
 
@@ -146,6 +153,16 @@ def quick(config: TaskConfig) -> TaskConfig:
         gaits={name: dataclasses.replace(gait, population=16, generations=5) for name, gait in config.gaits.items()},
         ppo=dataclasses.replace(config.ppo, timesteps=50_000, curve_every=2),
         evaluation=dataclasses.replace(config.evaluation, episodes=8),
+    )
+
+
+def within(config: TaskConfig, **env_kwargs: Any) -> TaskConfig:
+    """The same experiment in an environment made with these arguments: tuned, trained and judged there."""
+    return dataclasses.replace(
+        config,
+        gaits={name: dataclasses.replace(gait, env_kwargs=env_kwargs) for name, gait in config.gaits.items()},
+        ppo=dataclasses.replace(config.ppo, env_kwargs=env_kwargs),
+        evaluation=dataclasses.replace(config.evaluation, env_kwargs=env_kwargs),
     )
 
 

@@ -158,7 +158,7 @@ def evaluate(
     controller: Controller, env_id: str, config: EvaluationConfig, **options: Any
 ) -> tuple[Rollout, dict[str, Array]]:
     """Episodes of a controller from the starts that are kept for judging, and the numbers of each."""
-    envs = make_envs(env_id, config.episodes, whole_state=True, **options)
+    envs = make_envs(env_id, config.episodes, whole_state=True, **{**config.env_kwargs, **options})
     episodes = rollout(controller, envs, range(EVALUATION_SEEDS, EVALUATION_SEEDS + config.episodes))
     return episodes, measure(envs, episodes)
 
@@ -204,12 +204,14 @@ class Evaluate:
         env_id: environment; None for the one in the JSON file beside the policy.
         episodes: number of episodes.
         substeps: steps of the integrator in a hold; None for the environment's default.
+        drag: whether the mechanism's drag acts; None for what the JSON file beside the policy says it learned with.
     """
 
     policy: tyro.conf.Positional[Path]
     env_id: str | None = None
     episodes: int = 100
     substeps: int | None = None
+    drag: bool | None = None
 
     def __post_init__(self) -> None:
         if not self.policy.is_file():
@@ -225,13 +227,20 @@ class Evaluate:
             raise ValueError(f"give --env-id: there is no {beside} that names the environment")
         return check_env_id(str(read_json(beside)["settings"]["env_id"]))
 
+    def env_kwargs(self) -> dict[str, Any]:
+        """Arguments of the environment: those it learned with if they are written beside the policy, and `drag`."""
+        beside = self.policy.with_suffix(".json")
+        learned = read_json(beside)["settings"].get("ppo", {}).get("env_kwargs", {}) if beside.is_file() else {}
+        return learned if self.drag is None else {**learned, "drag": self.drag}
+
 
 def main(options: Evaluate) -> None:
     """Print a table of what the policy does."""
-    config = EvaluationConfig(episodes=options.episodes)
+    config = EvaluationConfig(episodes=options.episodes, env_kwargs=options.env_kwargs())
     env_id = options.environment()
     _, numbers = evaluate(load_policy(options.policy), env_id, config, substeps=options.substeps)
-    table = Table(title=f"{env_id}: {options.episodes} episodes")
+    made_with = "".join(f", {name}={value}" for name, value in config.env_kwargs.items())
+    table = Table(title=f"{env_id}{made_with}: {options.episodes} episodes")
     for heading in ("", "mean", "std", "min", "max"):
         table.add_column(heading, justify="right")
     for name, values in numbers.items():

@@ -53,7 +53,7 @@ class Joints:
 
     def __init__(self, env: LocomotionEnv | LocomotionVectorEnv) -> None:
         mechanism, names = env.mechanism, env.mechanism.coordinates
-        self.model = Model(mechanism, env.params)
+        self.model = Model(mechanism, env.params, drag=env.drag)
         self.limits, self.dt = env.torque_limits, env.dt
         self.index = joint_index(mechanism)
         self.stops = np.array([mechanism.joint_limits.get(names[i], np.inf) for i in self.index])
@@ -234,7 +234,7 @@ def tune(env_id: str, config: GaitConfig, report: Report = ignore) -> Tuned:
         config: settings of the search.
         report: hears of every generation.
     """
-    ranges = bounds(Joints(make_envs(env_id, 1)), config)
+    ranges = bounds(Joints(make_envs(env_id, 1, **config.env_kwargs)), config)
     history: list[float] = []
     episodes = 0
 
@@ -243,7 +243,7 @@ def tune(env_id: str, config: GaitConfig, report: Report = ignore) -> Tuned:
         nonlocal episodes
         count = candidates.shape[1]
         seeds = [TUNING_SEEDS + start for start in range(config.starts)] * count
-        envs = make_envs(env_id, len(seeds))
+        envs = make_envs(env_id, len(seeds), **config.env_kwargs)
         controller = sinusoid(envs, config, np.repeat(candidates.T, config.starts, axis=0))
         outcome = rollout(controller, envs, seeds, record=False)
         means = outcome.returns.reshape(count, config.starts).mean(axis=1)

@@ -26,7 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from nhenv.sb3 import make_sb3_vec_env
-from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
+from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed, within
 from training.evaluate import PolicyController, make_envs, measure, rollout
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
@@ -61,7 +61,7 @@ class Run(BaseCallback):
         super().__init__()
         self.config, self.checkpoint, self.report = config, checkpoint, report
         self.curve: list[dict[str, float]] = []
-        self._envs = make_envs(env_id, config.curve_episodes, whole_state=True)
+        self._envs = make_envs(env_id, config.curve_episodes, whole_state=True, **config.env_kwargs)
         self._before = {"wall_s": 0.0, "cpu_s": 0.0}  # spent before an interruption
         self._began = _clocks()
 
@@ -122,7 +122,7 @@ def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
     """An untrained model."""
     return PPO(
         "MlpPolicy",
-        make_sb3_vec_env(check_env_id(env_id), config.n_envs),
+        make_sb3_vec_env(check_env_id(env_id), config.n_envs, **config.env_kwargs),
         learning_rate=Linear(*config.learning_rate),
         n_steps=config.n_steps,
         batch_size=config.batch_size,
@@ -190,12 +190,14 @@ class Train:
         env_id: environment.
         seed: number of the run.
         timesteps: environment steps; None for the settings of the task.
+        drag: let the mechanism's drag act.
         out: folder of the results.
     """
 
     env_id: str
     seed: int = 0
     timesteps: int | None = None
+    drag: bool = False
     out: Path = Path("runs/train")
 
     def __post_init__(self) -> None:
@@ -205,7 +207,7 @@ class Train:
 
 def main(options: Train) -> None:
     """Train under a progress bar."""
-    config = for_env(options.env_id).ppo
+    config = within(for_env(options.env_id), **({"drag": True} if options.drag else {})).ppo
     if options.timesteps is not None:
         config = dataclasses.replace(config, timesteps=options.timesteps)
     path = ppo_path(options.env_id, config, options.seed, options.out).with_suffix(".zip")

@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 
 import mechanics
-from mechanics import Mechanism
+from mechanics import Mechanism, Model
 from mechanics.expressions import ExpressionError, to_sympy
 from mechanics.mechanism import MechanismError
 
@@ -238,7 +238,9 @@ def test_the_drag_tensor_is_the_hessian():
 def test_drag_coefficients():
     spec = sleigh(rayleigh="(a*x_dot**2 + b*(y_dot - x_dot)**2)/2", drag={"a": 0.1, "b": 0})
     mechanism = Mechanism.from_dict(spec)
-    assert mechanism.drag_coefficients(None) == mechanism.drag_coefficients(False) == {}
+    for none in (None, False, np.False_):
+        assert mechanism.drag_coefficients(none) is None
+    assert mechanism.drag_coefficients(True) == mechanism.drag_coefficients(np.True_) == mechanism.drag_coefficients({})
     assert mechanism.drag_coefficients(True) == {"a": 0.1, "b": 0.0}
     assert mechanism.drag_coefficients({"b": 2}) == {"a": 0.1, "b": 2.0}
     for given, reason in (
@@ -250,5 +252,21 @@ def test_drag_coefficients():
     ):
         with pytest.raises(MechanismError, match=reason):
             mechanism.drag_coefficients(given)
-    with pytest.raises(MechanismError, match="has no drag"):
+    with pytest.raises(MechanismError, match=r"has no drag.* as these do: snakeboard, roller_racer") as error:
         Mechanism.from_dict(SLEIGH).drag_coefficients(True)
+    assert "suslov" not in str(error.value)
+
+
+def test_drag_without_coefficients_acts_too():
+    """Whether drag acts and which coefficients it has are two questions."""
+    mechanism = Mechanism.from_dict(sleigh(rayleigh="x_dot**2"))
+    assert mechanism.drag_coefficients(True) == {}
+    q, v = np.zeros(mechanism.n), np.ones(mechanism.rank)
+    u = np.zeros(len(mechanism.controls))
+    rates = [Model(mechanism, drag=drag).rates(q, v, u) for drag in (True, False)]
+    assert np.abs(rates[0] - rates[1]).max() > 0.1
+
+
+def test_a_mechanism_without_its_drag_is_one_that_never_had_any():
+    spec = sleigh(rayleigh="a*x_dot**2", drag={"a": 0.1})
+    assert Mechanism.from_dict(spec).without_drag() == Mechanism.from_dict(SLEIGH)

@@ -25,7 +25,7 @@ class Joint:
         # The control that acts on this joint alone.
         covector = ["1" if c == name else "0" for c in mechanism.coordinates]
         self.control = [list(row) for row in mechanism.forces.values()].index(covector)
-        self.env, self.mechanism, self.model = env, mechanism, Model(mechanism, env.params)
+        self.env, self.mechanism, self.model = env, mechanism, Model(mechanism, env.params, drag=env.drag)
         # The pseudo-velocity that moves it.
         frame = self.model.velocity(np.zeros(mechanism.n), np.eye(mechanism.rank))
         (self.moving,) = np.flatnonzero(frame[:, self.place])
@@ -50,12 +50,12 @@ def env_id(request):
     return request.param
 
 
-@pytest.fixture
-def joint(env_id, bare):
-    """Joint of an environment whose torque limits are 1 unless asked."""
+@pytest.fixture(params=[False, True], ids=["ideal", "drag"])
+def joint(env_id, bare, request):
+    """Joint of an environment whose torque limits are 1 unless asked, without drag and with it."""
 
     def make_joint(**kwargs):
-        return Joint(bare(env_id, **{"torque_limits": 1.0, **kwargs}))
+        return Joint(bare(env_id, **{"torque_limits": 1.0, "drag": request.param, **kwargs}))
 
     return make_joint
 

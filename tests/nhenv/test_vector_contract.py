@@ -625,6 +625,13 @@ ARGUMENTS = {
     "parameter of a row": ({"params": {"m": [4.0, -1.0, 4.0]}}, MechanismError, ["row 1", "positive", "m=-1"]),
     "parameter NaN": ({"params": {"m": [4.0, 4.0, np.nan]}}, MechanismError, ["row 2", "m", "nan"]),
     "first row": ({"params": {"m": [-1.0, 4.0, 4.0]}}, MechanismError, ["positive", "m=-1"]),
+    "drag misspelt": ({"drag": {"b_phy": np.ones(N)}}, MechanismError, ["'b_phy'", "mean 'b_phi'"]),
+    "drag shape": ({"drag": {"C": np.ones(4)}}, ValueError, ["drag: C", "(3,)", "(4,)"]),
+    "drag words": ({"drag": {"C": ["a", "b", "c"]}}, ValueError, ["drag: C", "3 of them", "'a'"]),
+    "drag of a row": ({"drag": {"C": [1.0, 0.0, -1.0]}}, MechanismError, ["row 2", "drag coefficient C", "-1.0"]),
+    "drag NaN": ({"drag": {"C": [1.0, np.nan, 1.0]}}, MechanismError, ["row 1", "C", "finite"]),
+    "drag of the first row": ({"drag": {"C": [-1.0, 1.0, 1.0]}}, MechanismError, ["drag coefficient C", "-1.0"]),
+    "drag bare": ({"drag": np.ones(N)}, MechanismError, ["drag", "True, False or coefficients"]),
     "torque misspelt": ({"torque_limits": {"u_phy": np.ones(N)}}, ValueError, ["'u_phy'", "mean 'u_phi'"]),
     "torque shape": ({"torque_limits": {"u_phi": np.ones(2)}}, ValueError, ["torque_limits: u_phi", "(3,)", "(2,)"]),
     "torque of a row": ({"torque_limits": {"u_phi": [1.0, 0.0, 1.0]}}, ValueError, ["u_phi", "positive"]),
@@ -722,19 +729,33 @@ def test_parameters_of_rows_that_share_them(rows):
         ({"params": {"m": -1.0}}, ["row 0", "positive"]),
         ({"params": {"m": 5.0}, "torque_limits": {"u_phi": -1.0}}, ["u_phi", "positive"]),
         ({"torque_limits": {"u_phy": 1.0}}, ["'u_phy'", "mean 'u_phi'"]),
+        ({"drag": {"b_phy": 1.0}}, ["'b_phy'", "mean 'b_phi'"]),
+        ({"drag": {"C": -1.0}}, ["row 0", "drag coefficient C", "at least 0"]),
+        ({"drag": {"C": 0.5, "b_phi": np.nan}}, ["row 0", "b_phi", "finite"]),
+        ({"params": {"m": 5.0}, "drag": {"C": np.ones(2)}}, ["drag: C", "(3,)", "(2,)"]),
+        ({"drag": False}, ["drag", "by name", "cannot change"]),
         ({"params": {"m": 5.0}, "mask": np.zeros(3, bool)}, ["mask", "selects no row"]),
         ({"params": {"m": 5.0}, "mask": [True] * 3}, ["mask", "NumPy array"]),
     ],
 )
 def test_impossible_parameters_of_rows(rows, given, words):
     """Refused, and none of them is taken."""
-    env = rows(params={"m": np.array([4.0, 5.0, 6.0])})
+    env = rows(params={"m": np.array([4.0, 5.0, 6.0])}, drag={"C": 0.4})
     blocks = env._memory.blocks.copy()
     with pytest.raises(ValueError, match=r".") as error:
         env.set_params(**given)
     _message(error, *words)
     assert env.params["m"].tolist() == [4.0, 5.0, 6.0]
+    assert env.drag["C"] == 0.4
     assert np.array_equal(env._memory.blocks, blocks)
+
+
+def test_drag_of_rows_that_have_none(rows):
+    env = rows(params={"m": np.array([4.0, 5.0, 6.0])})
+    with pytest.raises(ValueError, match="have none") as error:
+        env.set_params(drag={"C": 0.5})
+    _message(error, "C cannot change", "drag=True")
+    assert env.drag is None
 
 
 def test_parameters_of_some_rows_before_the_first_reset(rows):

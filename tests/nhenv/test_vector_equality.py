@@ -135,6 +135,8 @@ VARIANTS = {
     "the whole state": (SNAKEBOARD, {"whole_state": True}),
     "parameters": (SNAKEBOARD, {"params": {"m": 5.0, "J_r": 0.1}, "dt": 0.04, "reset_noise_scale": 0.8}),
     "substeps": ("nhenv/RollerRacerForward-v0", {"integrator": "rk4", "substeps": 3}),
+    "drag": (SNAKEBOARD, {"drag": True}),
+    "some drag": (RACER, {"drag": {"C": 0.05}, "goal_radius": 1.2}),
     "two joints": ("nhenv/TwoArmsForward-v0", {}),
 }
 

@@ -88,6 +88,16 @@ def test_changed_settings_invalidate_what_they_concern(finished, monkeypatch):
     assert options.jobs() == []
 
 
+def test_drag_is_another_experiment(finished):
+    options, *_ = finished
+    dragged = dataclasses.replace(options, drag=True)
+    config = dragged.config(SNAKEBOARD)
+    for part in (config.gaits["sinusoid"], config.ppo, config.evaluation):
+        assert part.env_kwargs == {"drag": True}
+    assert len(dragged.jobs()) == 2
+    assert options.jobs() == []
+
+
 def test_options_are_checked():
     with pytest.raises(ValueError, match="Did you mean 'nhenv/SnakeboardForward-v0'"):
         Compare(env_ids=("nhenv/SnakeBoardForward-v0",))

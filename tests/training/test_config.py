@@ -19,6 +19,7 @@ from training.config import (
     for_env,
     quick,
     training_seed,
+    within,
 )
 from training.gaits import gait_path
 from training.store import digest, piece_path, read_json, settings, write_bytes, write_json
@@ -31,6 +32,8 @@ def changed(value):
     """Something else of the same kind."""
     if isinstance(value, bool):
         return not value
+    if isinstance(value, dict):
+        return {**value, "drag": True}
     return (*value[:-1], value[-1] + 1) if isinstance(value, tuple) else value + 1
 
 
@@ -91,6 +94,13 @@ def test_quick_is_shorter():
     assert short.ppo.timesteps < config.ppo.timesteps
     assert all(short.gaits[name].generations < gait.generations for name, gait in config.gaits.items())
     assert isinstance(short.evaluation, EvaluationConfig)
+
+
+def test_an_experiment_within_an_environment_is_so_in_all_its_parts():
+    config = within(for_env(SNAKEBOARD), drag=True)
+    parts = [*config.gaits.values(), config.ppo, config.evaluation]
+    assert [part.env_kwargs for part in parts] == [{"drag": True}] * len(parts)
+    assert within(config) == for_env(SNAKEBOARD)
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import pytest
 from mechanics.mechanism import Mechanism
 from training.config import COMPARED
 from training.evaluate import Evaluate, joint_index, make_envs, measure, rollout, summary
+from training.store import write_json
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 GOAL = "nhenv/RollerRacerGoal-v0"
@@ -209,6 +210,16 @@ def test_options_name_what_is_missing(tmp_path):
     (tmp_path / "policy.zip").touch()
     with pytest.raises(ValueError, match="give --env-id"):
         Evaluate(tmp_path / "policy.zip")
+
+
+def test_a_policy_is_judged_where_it_learned_unless_asked(tmp_path):
+    policy = tmp_path / "policy.zip"
+    policy.touch()
+    assert Evaluate(policy, SNAKEBOARD).env_kwargs() == {}
+    settings = {"env_id": SNAKEBOARD, "ppo": {"env_kwargs": {"drag": True, "dt": 0.04}}}
+    write_json(policy.with_suffix(".json"), {"settings": settings})
+    assert Evaluate(policy).env_kwargs() == {"drag": True, "dt": 0.04}
+    assert Evaluate(policy, drag=False).env_kwargs() == {"drag": False, "dt": 0.04}
 
 
 def test_help_warns_of_unpickling():

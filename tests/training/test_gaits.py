@@ -1,8 +1,11 @@
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from training.config import COMPARED, GaitConfig, for_env
+from mechanics.model import Model
+from training.config import COMPARED, EvaluationConfig, GaitConfig, for_env
 from training.evaluate import evaluate, make_envs, measure, rollout
 from training.gaits import Gait, Joints, Sinusoid, bounds, gait_path, sinusoid, tune, tune_piece
 from training.store import read_json
@@ -47,6 +50,21 @@ def test_computed_torque_gives_the_acceleration_asked_for(moving):
     torque = joints.torque(*joints.state(observation), wanted)
     given = joints.model.acceleration(env.q, env.v, torque)[joints.index]
     np.testing.assert_allclose(given, wanted, rtol=1e-5, atol=1e-5)  # float32 observations
+
+
+@every_environment
+def test_computed_torque_overcomes_the_drag_that_acts(env_id):
+    env = gym.make(env_id, drag={"b_psi": 0.04}, backend="numpy").unwrapped
+    observation, _ = env.reset(seed=3)
+    for _ in range(20):
+        observation, *_ = env.step(np.full(env.action_space.shape, 0.3, np.float32))
+    joints = Joints(env)
+    wanted = np.linspace(1.0, -2.0, len(joints.index))
+    torque = joints.torque(*joints.state(observation), wanted)
+    dragged, ideal = (Model(env.mechanism, drag=drag) for drag in (env.drag, None))
+    given = dragged.acceleration(env.q, env.v, torque)[joints.index]
+    np.testing.assert_allclose(given, wanted, rtol=1e-5, atol=1e-5)  # float32 observations
+    assert np.abs(ideal.acceleration(env.q, env.v, torque)[joints.index] - wanted).max() > 0.01
 
 
 # A fixed gait, and one that grows while it slows down.
@@ -141,6 +159,20 @@ def test_finished_gait_is_not_tuned_again(tmp_path):
     assert written["settings"]["gait"]["population"] == TINY.population
     assert len(written["result"]["vector"]) == 7
     tune_piece(SNAKEBOARD, TINY, tmp_path, lambda *message: pytest.fail("it tunes again"))
+
+
+def test_a_gait_is_tuned_and_judged_in_the_environment_that_is_asked_for():
+    weak = dataclasses.replace(TINY, generations=1, env_kwargs={"torque_limits": 0.01})
+    strong = dataclasses.replace(weak, env_kwargs={})
+    returns = [tune(SNAKEBOARD, config).history[-1] for config in (weak, strong)]
+    assert returns[0] < 0.1 * returns[1]
+    controller = sinusoid(make_envs(SNAKEBOARD, 1), TINY, np.ones(7))
+    judged = EvaluationConfig(episodes=2, env_kwargs={"torque_limits": 0.01})
+    asked = evaluate(controller, SNAKEBOARD, judged)[0].torques[:, 0]
+    plain = evaluate(controller, SNAKEBOARD, EvaluationConfig(episodes=2))[0].torques[:, 0]
+    twice = evaluate(controller, SNAKEBOARD, judged, torque_limits=0.02)[0].torques[:, 0]
+    assert asked == pytest.approx(plain * [0.01, 0.02])  # the same actions; by default 1 and 0.5 N m
+    assert twice == pytest.approx(2 * asked)
 
 
 def test_tuning_improves_on_its_start_and_is_reproducible():

@@ -7,9 +7,9 @@ import torch
 
 from training.config import PPOConfig
 from training.evaluate import load_policy
-from training.progress import Interrupted
+from training.progress import Interrupted, ignore
 from training.store import read_json
-from training.train import Linear, make_model, ppo_path, train_piece
+from training.train import Linear, Run, make_model, ppo_path, train_piece
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = PPOConfig(
@@ -95,6 +95,13 @@ def test_settings_reach_the_algorithm():
     for net in (model.policy.mlp_extractor.policy_net, model.policy.mlp_extractor.value_net):
         assert [type(layer) for layer in net] == [torch.nn.Linear, torch.nn.Tanh] * 2
         assert [layer.out_features for layer in net[::2]] == [16, 8]
+
+
+def test_it_learns_in_the_environment_that_is_asked_for(tmp_path):
+    config = dataclasses.replace(TINY, env_kwargs={"torque_limits": 0.25})
+    (limits,) = make_model(SNAKEBOARD, config, 0).get_env().get_attr("torque_limits", 0)
+    assert limits.tolist() == [0.25, 0.25]
+    assert Run(SNAKEBOARD, config, tmp_path, ignore)._envs.torque_limits[0].tolist() == [0.25, 0.25]
 
 
 def test_linear_schedule():
