@@ -26,6 +26,7 @@ Init = TypeVar("Init", bound=Callable[..., None])
 
 TOLERANCE = 1e-10
 SMALLEST_TOLERANCE = 1e-13
+SHORTEST_PERIOD = 1e-9
 
 
 class Configuration:
@@ -75,6 +76,8 @@ class Configuration:
         self.params = self.mechanism.resolve(params)
         self.drag = self.mechanism.drag_coefficients(drag)
         self.dt = checks.positive("dt", dt)
+        if self.dt < SHORTEST_PERIOD:
+            raise ValueError(f"dt must be at least {SHORTEST_PERIOD} s, lest rates of change be roundings, got {dt!r}")
         self.torque_limits = self._torque_limits(torque_limits)
         self.joint_limits = self._joint_limits(joint_limits)
         self.reset_noise_scale = self._noise(reset_noise_scale)

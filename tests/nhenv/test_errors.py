@@ -69,6 +69,13 @@ ARGUMENTS = {
     "torque limits shape": (RACER, {"torque_limits": [1, 2]}, ValueError, ["torque_limits", "u_psi", "[1, 2]"]),
     "joint limit unknown": (SNAKEBOARD, {"joint_limits": {"psi": 1}}, ValueError, ["'psi'", "known: phi"]),
     "joint limit negative": (SNAKEBOARD, {"joint_limits": {"phi": -1}}, ValueError, ["joint limit of phi", "positive"]),
+    "dt too small": (RACER, {"dt": 5e-324}, ValueError, ["dt", "at least 1e-09 s", "5e-324"]),
+    "tolerance zero": (RACER, {"tolerance": 0}, ValueError, ["tolerance", "positive", "got 0"]),
+    "tolerance too small": (RACER, {"tolerance": 1e-20}, ValueError, ["tolerance", "at least 1e-13", "1e-20"]),
+    "tolerance large": (RACER, {"tolerance": 2.0}, ValueError, ["tolerance", "below 1", "2.0"]),
+    "no estimate": (
+        SNAKEBOARD, {"tolerance": 1e-8, "integrator": "gauss2"}, ValueError, ["gauss2", "too few stages", "None"]
+    ),
     "whole state": (RACER, {"whole_state": 1}, ValueError, ["whole_state", "True or False", "got 1"]),
     "joint limit bare": (RACER, {"joint_limits": 1.0}, ValueError, ["joint_limits", "True, False", "1.0"]),
 }  # fmt: skip
