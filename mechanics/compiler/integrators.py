@@ -99,7 +99,7 @@ class Method:
         if first and self.symmetric:
             d, p = first
             others = [other - (other @ d) * d for other in self._null(p - 1)]
-            found += [(max(others, key=np.linalg.norm), p - 1)] * bool(others)
+            found += [(max(others, key=np.linalg.norm), p - 1)] if others else []
         if len(found) < 1 + self.symmetric:
             raise ValueError(f"{self.name} has too few stages for an estimate of its error; choose another method")
         return tuple((tuple((d / np.abs(d).sum()).tolist()), p) for d, p in found)
