@@ -219,7 +219,7 @@ def fuzz_rows(
         own = {**mechanism.parameters, **options(mechanism, rng).get("params", {})}
         try:
             mechanism.resolve(own)
-            single._configuration.numbers(own)
+            single._configuration.numbers(own, None)
         except ValueError:
             report.refused += 1
             continue

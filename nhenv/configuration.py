@@ -59,6 +59,7 @@ class Configuration:
         integrator: str = "auto",
         substeps: int | None = None,
         tolerance: float | None = None,
+        keep_energy: bool = False,
         reset_noise_scale: float = 0.05,
         backend: str = "numba",
         whole_state: bool = False,
@@ -67,8 +68,9 @@ class Configuration:
     ) -> None:
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, got {render_mode!r}: these environments do not draw")
-        if not isinstance(whole_state, bool | np.bool_):
-            raise ValueError(f"whole_state must be True or False, got {whole_state!r}")
+        for name, value in {"keep_energy": keep_energy, "whole_state": whole_state}.items():
+            if not isinstance(value, bool | np.bool_):
+                raise ValueError(f"{name} must be True or False, got {value!r}")
         self.mechanism = in_the_plane(as_mechanism(mechanism))
         self.task = tasks.get(task)
         if problem := unfit(self.mechanism, self.task):
@@ -91,6 +93,7 @@ class Configuration:
             integrator=integrator,
             substeps=None if substeps is None else checks.whole("substeps", substeps),
             tolerance=_tolerance(tolerance, integrator),
+            keep_energy=bool(keep_energy),
             backend=backend,
             whole_state=bool(whole_state),
         )

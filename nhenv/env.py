@@ -131,6 +131,11 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         tolerance: largest error of a control period, by the method's own estimate: of a state z, tolerance (1 + |z|).
             Where a step is estimated to be worse it is halved until it is not; where nothing helps, the episode ends
             with info["diverged"]. None: 1e-10 with integrator "auto", no control with one that is named.
+        keep_energy: whether every step of the method ends by scaling the pseudo-velocities, by 1 up to the step's own
+            error, so that the energy changes by the work of the held torques and, but for roundings, by nothing else:
+            for long unforced runs. Stops still take energy away. Needs controls with constant covectors, such as
+            torques on joints. So near to rest that this would move a velocity by more than ten times the tolerance,
+            the velocities stay as they are.
         reset_noise_scale: half-width of the initial angles, in rad.
         backend: "numba", or "numpy" for kernels that are interpreted: nothing is compiled, each step
             takes some fifty times as long, and a debugger can walk through it.

@@ -20,6 +20,7 @@ from mechanics.compiler.codegen import Program, integrated, operation_count
 from mechanics.compiler.dataflow import analyse, initial
 from mechanics.compiler.integrators import Method, method
 from mechanics.expressions import ExpressionError, to_sympy
+from mechanics.geometry.energy import conserved
 from mechanics.geometry.reduction import ReducedEquations, derive
 from mechanics.geometry.symmetry import planar_symmetry
 from nhenv.observation import default_observation
@@ -52,7 +53,11 @@ class Generator:
         accelerations = dict(zip(equations.pseudo_velocities, equations.acceleration, strict=True))
         held = {rate: free for (_, rate), free in zip(self.joints, self.free, strict=True)}
         rates = {**velocities, **{v: rate * held.get(v, 1) for v, rate in accelerations.items()}}
-        wanted = self._wanted(rates, [*observation.values(), *judgement.values(), *ending.values()])
+        self.speeds = equations.pseudo_velocities if scene.keep_energy else ()
+        parts = conserved(equations) if scene.keep_energy else {}
+        self.energy = {f"energy:{part}": expression for part, expression in parts.items()}
+        outputs = [*observation.values(), *judgement.values(), *ending.values(), *self.energy.values()]
+        wanted = self._wanted(rates, outputs)
         self.flow = analyse(rates, wanted, equations.definitions)
         self.joint_rates = {f"qdot:{angle}": velocities[angle] for angle, _ in self.joints}
         joint_accelerations = {f"vdot:{angle}": accelerations[rate] for angle, rate in self.joints}
@@ -65,8 +70,10 @@ class Generator:
         self.method, self.substeps = self._method()
         self.controlled = scene.tolerance < inf  # then a flight may turn out not to be right
         self.events = bool(self.joints) or self.controlled  # so that a hold may take more than one flight
-        outputs = {**integrated(self.flow), **observation, **judgement, **ending, **self.motion, **self.rules}
-        self.program = Program(outputs, [sp.Symbol(name) for name in scene.parameters], equations.definitions)
+        texts = {**observation, **judgement, **ending, **self.motion, **self.rules, **self.energy}
+        self.program = Program(
+            {**integrated(self.flow), **texts}, [sp.Symbol(name) for name in scene.parameters], equations.definitions
+        )
 
     def _task_expressions(self) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr], dict[str, sp.Expr]]:
         """Observation, judgement (reward terms, then info) and termination as expressions in the states."""
@@ -186,7 +193,16 @@ class Generator:
     ) -> str:
         """Source of the flight: see `Program.step_function`."""
         return self.program.step_function(
-            name, self.flow, self.method, substeps, self.held, backend, carried, streams, self.scene.tolerance
+            name,
+            self.flow,
+            self.method,
+            substeps,
+            self.held,
+            backend,
+            carried,
+            streams,
+            self.scene.tolerance,
+            self.speeds,
         )
 
     def _clear_joints(self, backend: Backend) -> str:

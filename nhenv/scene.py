@@ -60,6 +60,8 @@ class Scene:
         substeps: steps of the method in a hold; None for the default.
         tolerance: what no flight may get wrong by the method's own estimate, of a state z in (1 + |z|); a hold is
             divided into as many flights as that takes. Infinite: whatever the method gives.
+        keep_energy: whether every step of the method ends with velocities that have the energy which the held controls
+            and the potential leave them.
         backend: "numba" or "numpy".
         whole_state: whether states are followed that nothing observed, rewarded or reported depends on.
     """
@@ -72,6 +74,7 @@ class Scene:
     integrator: str = "auto"
     substeps: int | None = None
     tolerance: float = math.inf
+    keep_energy: bool = False
     backend: str = "numba"
     whole_state: bool = False
 

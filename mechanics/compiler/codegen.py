@@ -26,6 +26,12 @@ __all__ = ["Program", "integrated", "needed", "operation_count"]
 # In rad, within a step: beyond this, errors may be aliased, and so escape the estimate.
 LARGEST_TURN = 1.5
 
+# Kept energy moves no velocity by more than this, in errors that the tolerance allows. Where hardly any kinetic energy
+# is left to be corrected, a correction would do more harm than good; elsewhere, a step that is right needs one at most.
+LARGEST_CORRECTION = 10.0
+# What a quotient of two energies that are both zero is kept from being undefined by; far below any other, in J.
+NO_ENERGY = 1e-300
+
 # d sin = cos * rate, d cos = -sin * rate
 _QUARTER_TURN: dict[type, tuple[type, str]] = {sp.sin: (sp.cos, ""), sp.cos: (sp.sin, "-")}
 
@@ -166,6 +172,7 @@ class Program:
         carried: Mapping[str, sp.Expr] | None = None,
         streams: int = 1,
         tolerance: float = inf,
+        speeds: Sequence[sp.Symbol] = (),
     ) -> str:
         """Source of `name(_h, *states, *carried, *held, _k)` -> states after _h seconds, and whether they are right.
 
@@ -174,6 +181,9 @@ class Program:
 
         With several streams, of one that takes these arguments for one system after the other, and does every
         operation for one after the other: what one waits for, another uses the time of.
+
+        Given `speeds`, every substep ends with these states multiplied by what keeps the sum of the outputs
+        "energy:kinetic", quadratic in them, and "energy:potential" as it was: see `_energy_kept`.
 
         Outputs of this program must include "rate:STATE" for each state of `flow` that is not
         exact and "solution:STATE:POWER" for each coefficient of each that is: see `integrated`.
@@ -226,6 +236,9 @@ class Program:
                 bound = backend.sum_of_products([(limits[which], f"fabs({end[state]})")], limits[which])
                 right.append(f"(fabs({error}) <= {bound})")
             right += [f"(fabs({end[a]} - {a.name}) <= {LARGEST_TURN!r})" for a in self._turning(flow)]
+        if speeds:
+            beginning = next((stage for stage in stages if stage.is_start), start)
+            end = self._energy_kept(body, beginning, end, held, speeds, tolerance)
         names = [state.name for state in flow.states]
         arguments = ["_h", *names, *carried, *(symbol.name for symbol in held)]
         names = [*names, "_right"]
@@ -244,6 +257,42 @@ class Program:
             lines = ["_right = True", f"_h = _h*{1 / substeps!r}", f"for _ in range({substeps}):\n{loop}"]
         lines = [*self._unpack(body), *lines, f"return ({''.join(f'{n}, ' for n in names)})"]
         return _function(name, [*arguments, "_k"], lines, backend.decorator)
+
+    def _energy_kept(
+        self,
+        body: _Body,
+        start: _Point,
+        end: Mapping[sp.Symbol, str],
+        held: Sequence[sp.Symbol],
+        speeds: Sequence[sp.Symbol],
+        tolerance: float,
+    ) -> dict[sp.Symbol, str]:
+        """Lines that scale the speeds, and the names of all states after that.
+
+        By s = sqrt(K_wanted/K_1), with K_wanted = K_0 + U_0 - U_1 the kinetic energy that the potential U leaves for
+        the end. The method's error in the energy is of its order, hence so is s - 1. It is written without a
+        difference of almost equal numbers, so that roundings are those of the energy and do not drift.
+        """
+        end = {state: body.assign(f"_m_{state.name}", value) for state, value in end.items()}
+        finish = _Point("__end", {**end, **{symbol: symbol.name for symbol in held}})
+        kinetic, potential = self.outputs["energy:kinetic"], self.outputs["energy:potential"]
+        before = body.assign("_kinetic__start", body.value(kinetic, start))
+        after = body.assign("_kinetic__end", body.value(kinetic, finish))
+        wanted = before
+        if potential != 0:
+            fall = [body.assign(f"_potential{p.suffix}", body.value(potential, p)) for p in (start, finish)]
+            wanted = body.assign("_left", f"{before} + ({' - '.join(fall)})")
+            # A rounding may leave less than nothing.
+            wanted = body.assign("_wanted", f"0.5*({wanted} + fabs({wanted}))")
+        stretch = body.assign("_stretch", f"({wanted} - {after})/({after} + sqrt({wanted}*{after}) + {NO_ENERGY!r})")
+        if tolerance < inf:
+            limit = repr(LARGEST_CORRECTION * tolerance)
+            bounds = {v: body.sum_of_products([(limit, f"fabs({end[v]})")], limit) for v in speeds}
+            small = " & ".join(f"(fabs({stretch}*{end[v]}) <= {bound})" for v, bound in bounds.items())
+            stretch = body.assign("_stretch__kept", f"{stretch}*({small})")
+        for v in speeds:
+            end[v] = body.assign(f"_kept_{v.name}", body.sum_of_products([(stretch, end[v])], end[v]))
+        return end
 
     def _turning(self, flow: Dataflow) -> list[sp.Symbol]:
         """The states of which a rate takes a sine or cosine."""
@@ -336,7 +385,7 @@ class _Stage(_Point):
         at_start = _is_start(method, index)
         super().__init__("" if at_start else f"__{index + 1}", start.names if at_start else {})
         self._program, self._body, self._flow, self._start = program, body, flow, start
-        self._method, self._index, self._at_start = method, index, at_start
+        self._method, self._index, self.is_start = method, index, at_start
         self._rates: dict[sp.Symbol, str] = {}
         self._circle_rates: dict[tuple[type, sp.Symbol], str] = {}
         self.others: list[_Stage] = []
@@ -372,7 +421,7 @@ class _Stage(_Point):
         key = function(angle)
         if key not in self.names:
             name = f"_{function.__name__}_{angle.name}{self.suffix}"
-            if self._at_start:
+            if self.is_start:
                 value = f"{function.__name__}({angle.name})"
             else:
                 row = self._method.a[self._index]
@@ -428,6 +477,10 @@ class _Body:
         """
         products = [(repr(w), rate(stage)) for w, stage in zip(weights, stages, strict=True) if w]
         return self._backend.sum_of_products(products, base)
+
+    def sum_of_products(self, products: Sequence[tuple[str, str]], rest: str) -> str:
+        """Source of rest + sum of a*b, for factors that are names or numbers."""
+        return self._backend.sum_of_products(products, rest)
 
     def polynomial(self, state: sp.Symbol, time: str, start: _Point) -> str:
         """Source of an exact state after `time`, by Horner's rule; its coefficients hold for the whole step."""

@@ -77,6 +77,10 @@ ARGUMENTS = {
         SNAKEBOARD, {"tolerance": 1e-8, "integrator": "gauss2"}, ValueError, ["gauss2", "too few stages", "None"]
     ),
     "whole state": (RACER, {"whole_state": 1}, ValueError, ["whole_state", "True or False", "got 1"]),
+    "kept energy": (RACER, {"keep_energy": 1}, ValueError, ["keep_energy", "True or False", "got 1"]),
+    "kept energy, a force that turns": (
+        "nhenv/CarForward-v0", {"keep_energy": True}, ValueError, ["'F_rear'", "theta", "keep_energy=False"],
+    ),
     "joint limit bare": (RACER, {"joint_limits": 1.0}, ValueError, ["joint_limits", "True, False", "1.0"]),
 }  # fmt: skip
 

@@ -137,6 +137,8 @@ VARIANTS = {
     "substeps": ("nhenv/RollerRacerForward-v0", {"integrator": "rk4", "substeps": 3}),
     "drag": (SNAKEBOARD, {"drag": True}),
     "some drag": (RACER, {"drag": {"C": 0.05}, "goal_radius": 1.2}),
+    "kept energy": ("nhenv/RollerRacerForward-v0", {"keep_energy": True, "torque_limits": {"u_psi": 2.0}}),
+    "kept energy, explicit": (SNAKEBOARD, {"keep_energy": True, "tolerance": 1e-13}),
     "two joints": ("nhenv/TwoArmsForward-v0", {}),
 }
 

@@ -31,11 +31,24 @@ def stepper(execute):
     The state is a dictionary by symbol, of the states that the dataflow keeps.
     """
 
-    def make(rates, outputs, name, *, substeps=1, held=(), parameters=None, backend="numpy"):
+    def make(
+        rates,
+        outputs,
+        name,
+        *,
+        substeps=1,
+        held=(),
+        parameters=None,
+        backend="numpy",
+        energy=None,
+        speeds=(),
+        **options,
+    ):
         flow = analyse(rates, outputs)
         parameters = parameters or {}
-        program = Program(integrated(flow), parameters)
-        source = program.step_function("step", flow, method(name), substeps, held, BACKENDS[backend])
+        program = Program({**integrated(flow), **(energy or {})}, parameters)
+        options |= {"speeds": speeds} if energy else {}
+        source = program.step_function("step", flow, method(name), substeps, held, BACKENDS[backend], **options)
         source += "\n\n" + program.constants_function("constants", list(parameters))
         functions = execute(source, backend)
         k = np.array(functions["constants"](list(parameters.values())), dtype=float)
