@@ -37,7 +37,6 @@ Track = Callable[[Iterable[int], str], Iterable[int]]
 
 SAMPLES = 1000  # of a long run
 MILLION = 1_000_000
-ENERGY_KEEPING: dict[str, Any] | None = None  # arguments of the environment that choose the method that keeps energy
 SKIP = "skipped"
 STEPS = tuple(round(2 ** (k / 2)) for k in range(2, 17))  # of two seconds, to see orders; every other is twice as many
 RESOLVED = 1e-15  # errors below are those of rounding, and so are those near the least
@@ -169,10 +168,10 @@ def observed_order(name: str, integrator: str) -> Found:
     begin = dict(zip(rates, (*q, *np.zeros(mechanism.rank, np.longdouble)), strict=True))
     errors: list[float] = []
     for steps in STEPS:
-        state = tuple(begin[s] for s in flow.states)
+        state = [begin[s] for s in flow.states]
         with np.errstate(all="ignore"):  # a step of a second may end anywhere
             for _ in range(steps):
-                state = namespace["step"](duration / steps, *state, *u, constants)
+                *state, _ = namespace["step"](duration / steps, *state, *u, constants)
         end = dict(zip(flow.states, state, strict=True))
         errors.append(float(scaled([np.array([end[s] for s in equations.coordinates]) - truth.q[0]], truth.q)[0]))
     floor = max(10 * np.nanmin(errors), RESOLVED)

@@ -150,11 +150,8 @@ def runs(arguments: Arguments, track: invariants.Track) -> Iterator[Row]:
             yield _number(f"{name}, {words}: momentum {momentum}", Found(change + lost, 1e-12, "flat frame"))
     yield _number(f"snakeboard, {words}: energy", Found(board.energy, 1e-12))
     yield _number(f"roller_racer, {words}: energy, default", Found(racer.energy, None, "what it drifts"))
-    if invariants.ENERGY_KEEPING is None:
-        found = Found(math.nan, None, f"{SKIP}: no method that keeps energy is known to this benchmark")
-    else:
-        kept = invariants.long_run("roller_racer", steps, track, invariants.ENERGY_KEEPING)
-        found = Found(kept.energy if kept.finite else math.nan, 1e-10, f"{invariants.ENERGY_KEEPING}")
+    kept = invariants.long_run("roller_racer", steps, track, {"keep_energy": True})
+    found = Found(kept.energy if kept.finite else math.nan, 1e-10, "keep_energy=True")
     yield _number(f"roller_racer, {words}: energy, kept", found)
 
 
