@@ -1,11 +1,16 @@
 """Helpers for the tests of the environments."""
 
+import sys
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import mechanics
 import nhenv
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what tests share
 
 # Their environments are compiled. Those of the other mechanisms are interpreted, and only in the slow tests; that
 # both backends agree is a test of its own.

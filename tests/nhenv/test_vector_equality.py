@@ -162,6 +162,93 @@ def test_variants_equal_single_environments(env_id, arguments, backend, mode):
     assert (touched > 0) == bool(native.joint_limits)
 
 
+# Holds so long, and torques so large, that few of them are right in one flight.
+HARD = {
+    "layers": (SNAKEBOARD, {}),
+    "core": (RACER, {}),
+    "no joints": ("nhenv/ChaplyginBeanieForward-v0", {}),
+    "two joints": ("nhenv/TwoArmsForward-v0", {}),
+    "layers, no stops": (SNAKEBOARD, {"joint_limits": False}),
+    "core, no stops": (RACER, {"joint_limits": False}),
+    "no core, no joints": ("nhenv/DifferentialDriveForward-v0", {}),
+    "released": ("nhenv/FallingRollingDiskForward-v0", {}),
+    "each with its own": (SNAKEBOARD, {"params": {"m": np.array([4.0, 5.0, 6.0])}}),
+}
+
+
+@pytest.fixture
+def late_rows(monkeypatch):
+    """Count the rows of an interpreted vector environment that go in shorter flights, and those left to `hold`."""
+
+    def watch(native, counts):
+        kernel = native._kernel
+        begin, end, hold = kernel.begin_flights, kernel.end_flights, kernel.hold
+
+        def begin_flights(p, w, count, numbers):
+            counts["late"] += int(count)
+            begin(p, w, count, numbers)
+
+        def end_flights(p, w, count, numbers):
+            lost = end(p, w, count, numbers)
+            counts["through"] += int(count - lost)
+            return lost
+
+        def counted(*arguments):
+            counts["held"] += 1
+            return hold(*arguments)
+
+        for name, function in (("begin_flights", begin_flights), ("end_flights", end_flights), ("hold", counted)):
+            monkeypatch.setattr(kernel, name, function)
+
+    return watch
+
+
+def _hard_pair(env_id, arguments, size, mode, dt, factor, **more):
+    """A pair with so many times the usual torques; each row with parameters of its own if they are given like that."""
+    one = gym.make(env_id, backend="numpy").unwrapped
+    limits = dict(zip(one.mechanism.controls, factor * one.torque_limits, strict=True))
+    shared = {"dt": dt, "torque_limits": limits, "max_episode_steps": 4, **more}
+    if "params" not in arguments:
+        return _pair(env_id, size, mode, **shared, **arguments)
+    native = gym.make_vec(env_id, num_envs=size, autoreset_mode=mode.value, info="all", **shared, **arguments)
+    single = [{name: float(value[row]) for name, value in arguments["params"].items()} for row in range(size)]
+    made = [lambda params=params: gym.make(env_id, params=params, **shared) for params in single]
+    return native, SyncVectorEnv(made, autoreset_mode=mode)
+
+
+def _hard_cases():
+    """The first four in every mode, the others in one."""
+    for i, (name, case) in enumerate(HARD.items()):
+        for mode in AutoresetMode if i < 4 else [AutoresetMode.SAME_STEP]:
+            marks = [pytest.mark.slow] if name == "core, no stops" else []
+            yield pytest.param(*case, mode, id=f"{name}-{mode.value}", marks=marks)
+
+
+@pytest.mark.usefixtures("two_arms")
+@pytest.mark.parametrize(("env_id", "arguments", "mode"), list(_hard_cases()))
+def test_hard_holds_equal_those_of_single_environments(env_id, arguments, mode, late_rows):
+    """To the last bit, whether rows go in shorter flights side by side or, where a few do not do, one by one."""
+    counts = {"late": 0, "through": 0, "held": 0}
+    # Many times the usual torques, then a few, with which the flights of most rows are halved once or twice.
+    for dt, factor in ((0.3, 20), (0.2, 2)):
+        native, sync = _hard_pair(env_id, arguments, 3, mode, dt, factor, backend="numpy")
+        late_rows(native, counts)
+        _assert_equal_rollouts(native, sync, 15)
+    assert counts["late"] >= 10, counts
+    assert counts["through"] >= 3, counts
+    if native.joint_limits:
+        assert counts["held"] > 0, counts
+
+
+@pytest.mark.slow
+@MODES
+@pytest.mark.usefixtures("two_arms")
+@pytest.mark.parametrize(("env_id", "arguments"), list(HARD.values())[:-1], ids=list(HARD)[:-1])
+def test_compiled_hard_holds_equal_those_of_single_environments(env_id, arguments, mode):
+    for dt, factor in ((0.3, 20), (0.2, 2)):
+        _assert_equal_rollouts(*_hard_pair(env_id, arguments, 131, mode, dt, factor), 60)
+
+
 @pytest.mark.parametrize(
     "env_id",
     [

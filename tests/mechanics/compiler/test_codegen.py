@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import math
 import re
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import sympy as sp
 
 from mechanics.compiler.backends import BACKENDS
-from mechanics.compiler.codegen import Program, integrated, operation_count
+from mechanics.compiler.codegen import LARGEST_TURN, Program, integrated, operation_count
 from mechanics.compiler.dataflow import analyse
 from mechanics.compiler.integrators import method
 from mechanics.expressions import ExpressionError, check_name
@@ -327,3 +328,139 @@ def test_nothing_is_carried_where_a_step_does_not_begin_with_a_stage(equations):
     flow = analyse(rates, list(rates))
     program = Program(integrated(flow), [sp.Symbol(p) for p in equations.mechanism.parameters])
     assert program.carried(flow, method("gauss4")) == {}
+
+
+# -- whether a step is right ----------------------------------------------------------------------
+
+PENDULUM = {x: y, y: -sp.sin(x)}
+
+
+@pytest.fixture
+def flight(execute):
+    """Generate a step with a tolerance: source, and function (h, *states) -> (*states, right), of each stream."""
+
+    def make(rates, name, tolerance, *, outputs=None, backend="numpy", **options):
+        flow = analyse(rates, outputs or list(rates))
+        source = Program(integrated(flow), []).step_function(
+            "step",
+            flow,
+            method(name),
+            options.pop("substeps", 1),
+            (),
+            BACKENDS[backend],
+            tolerance=tolerance,
+            **options,
+        )
+        step = execute(source, backend)["step"]
+        order = {state: i for i, state in enumerate(state for state in rates if state in flow.states)}
+        places = [order[state] for state in flow.states]
+
+        def call(*streams):
+            return step(*(number for h, *state in streams for number in (h, *(state[i] for i in places))), np.zeros(0))
+
+        return source, call
+
+    return make
+
+
+def _by_hand(name, h, start):
+    """The estimates of both states of Duffing's oscillator, each in proportion to one more than its size."""
+    row = method(name)
+    a, b, d = np.array(row.a), np.array(row.b), np.array([weights for weights, _ in row.estimates])
+    rates = np.zeros((row.stages, 2))
+    for i in range(row.stages):
+        place, speed = start + h * a[i] @ rates
+        rates[i] = speed, -(place**3)
+    return np.abs(h * d @ rates) / (1 + np.abs(start + h * b @ rates))
+
+
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+@pytest.mark.parametrize(("name", "tolerance"), [("rk4", 1e-6), ("dop853", 1e-10), ("verner9", 1e-10)])
+def test_a_step_is_right_if_the_estimates_of_all_states_are_small(name, tolerance, backend, flight):
+    """By hand, from the tableau."""
+    thresholds = np.array(method(name).thresholds(tolerance))[:, None]
+    _, step = flight({x: y, y: -(x**3)}, name, tolerance, backend=backend)
+    rng, decided = np.random.default_rng(0), {(False, False): 0, (False, True): 0, (True, False): 0, (True, True): 0}
+    for _ in range(800):
+        start = rng.uniform(-3, 3, 2) * 10 ** rng.uniform(-1, 1.5, 2)
+        h = 10 ** rng.uniform(-2.5, 0.2) / np.abs(start).max()
+        small = tuple((_by_hand(name, h, start) <= thresholds).all(axis=0).tolist())
+        assert step((h, *start))[-1] == all(small)
+        decided[small] += 1
+    # Each has its say on its own.
+    assert min(decided.values()) >= 1
+
+
+@pytest.mark.parametrize("name", ["rk4", "verner9", "gauss4", "lobatto6"])
+def test_each_integrated_state_has_its_say(name, flight):
+    """Of two states that know nothing of one another, either one makes a step wrong."""
+    forms = {x: sp.Integer(1), y: sp.exp(-(x**2)), z: sp.exp(-((x - 10) ** 2))}  # steep near x = 0, and near x = 10
+    for rates in (forms, {x: forms[x], z: forms[z], y: forms[y]}):
+        _, step = flight(rates, name, 1e-8)
+        for begin, right in ((-30.0, True), (-0.7, False), (9.3, False), (30.0, True)):
+            assert step((2.0, begin, 0.0, 0.0))[-1] == right
+    # What is pruned has none.
+    _, step = flight(forms, name, 1e-8, outputs=[y])
+    assert step((2.0, 9.3, 0.0))[-1]
+
+
+@pytest.mark.parametrize("name", ["rk4", "lobatto6"])
+def test_every_substep_must_be_right(name, flight):
+    """The one in which something happens may be the first, the last or one between."""
+    rates = {x: sp.Integer(1), y: sp.exp(-100 * x**2)}
+    _, whole = flight(rates, name, 1e-6)
+    _, split = flight(rates, name, 1e-6, substeps=4)
+    for begin in (0.0, -1.0, -2.0, -3.0, -4.0):
+        assert not split((4.0, begin, 0.0))[-1]
+    for begin in (-9.0, 5.0):
+        assert split((4.0, begin, 0.0))[-1]
+    # Short ones are right where a long one is not.
+    _, split = flight(rates, name, 1e-6, substeps=64)
+    assert not whole((0.5, 0.0, 0.0))[-1]
+    assert split((0.5, 0.0, 0.0))[-1]
+
+
+@pytest.mark.parametrize("name", ["rk4", "lobatto6"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_step_turns_angles_only_so_far(name, side, flight):
+    """Even where the estimate sees nothing wrong. What is no angle may go as far as it likes."""
+    _, step = flight({x: sp.Integer(side), y: 1e-12 * sp.cos(x) + z, z: sp.Integer(0)}, name, 1e-3)
+    assert step((0.999 * LARGEST_TURN, 0.2, 0.0, 100.0))[-1]
+    assert not step((1.001 * LARGEST_TURN, 0.2, 0.0, 0.0))[-1]
+
+
+@pytest.mark.parametrize("name", ["rk4", "lobatto6"])
+def test_what_is_no_number_is_not_right(name, flight):
+    rates = {x: y**2, y: sp.cos(z), z: sp.Integer(1)}
+    _, step = flight(rates, name, 1e-6)
+    assert step((0.01, 0.1, 0.2, 0.3))[-1]
+    for place in range(2):
+        state = [0.1, 0.2, 0.3]
+        state[place] = math.nan
+        assert not step((0.01, *state))[-1]
+
+
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_each_stream_is_right_or_not(backend, flight):
+    """And what it says is what one stream says."""
+    _, one = flight(PENDULUM, "rk4", 1e-6, backend=backend)
+    _, two = flight(PENDULUM, "rk4", 1e-6, backend=backend, streams=2)
+    good, bad = (0.01, 0.4, 0.9), (0.9, 0.4, 0.9)
+    assert (one(good)[-1], one(bad)[-1]) == (True, False)
+    for pair in ((good, bad), (bad, good), (good, good), (bad, bad)):
+        assert two(*pair) == (*one(pair[0]), *one(pair[1]))
+
+
+@pytest.mark.parametrize("streams", [1, 2])
+@pytest.mark.parametrize("name", ["rk4", "lobatto6"])
+def test_without_a_tolerance_a_step_bears_no_trace_of_one(name, streams, flight):
+    """Neither weights of an estimate nor a comparison, and the same numbers as with one."""
+    rates = {x: sp.Integer(1), y: sp.sin(x), z: sp.cos(x) * y}
+    plain, step = flight(rates, name, math.inf, streams=streams)
+    checked, other = flight(rates, name, 1e-3, streams=streams)
+    traces = ("_d_", "fabs(", "<=", repr(LARGEST_TURN))
+    assert not any(trace in plain for trace in traces)
+    assert all(trace in checked for trace in traces[1:])
+    arguments = [(0.1, 0.2, 0.3, 0.4)] * streams
+    assert step(*arguments) == other(*arguments)
+    assert plain.count("True") == streams

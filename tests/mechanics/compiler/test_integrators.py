@@ -8,12 +8,16 @@ import pytest
 import sympy as sp
 from scipy.integrate import solve_ivp
 
+from mechanics.compiler import integrators
 from mechanics.compiler.integrators import Method, method, method_names
 
 GAUSS = [name for name in method_names() if name.startswith("gauss")]
 LOBATTO = [name for name in method_names() if name.startswith("lobatto")]
 COLLOCATION = GAUSS + LOBATTO
 EXPLICIT = [name for name in method_names() if method(name).explicit]
+ESTIMATING = [name for name in method_names() if name not in ("gauss1", "gauss2")]
+# A threshold takes the trees of one order more: 12,486 for order 12.
+THRESHOLDS = [pytest.param(name, marks=pytest.mark.slow) if method(name).order == 12 else name for name in ESTIMATING]
 
 y1, y2, z1, z2 = sp.symbols("y1 y2 z1 z2")
 # A pendulum (a core) and a quadrature behind it; a chain in which each rate uses what is before it.
@@ -80,6 +84,7 @@ def test_order_conditions_of_rooted_trees(name):
     # The numbers of rooted trees: OEIS A000081.
     counts = (1, 1, 2, 4, 9, 20, 48, 115, 286)
     assert tuple(len(_trees(order)) for order in range(1, 10)) == counts
+    assert tuple(len(integrators._trees(order)) for order in range(1, 10)) == counts
     # With ten nodes and more there are thousands, and the simplifying assumptions below imply them all.
     for order in range(1, min(method(name).order, 9) + 1):
         for tree in _trees(order):
@@ -168,6 +173,115 @@ def test_a_consistent_tableau_is_accepted():
     heun = Method("heun", ((0.0, 0.0), (1.0, 0.0)), (0.5, 0.5), (0.0, 1.0), 2, "Heun 1900")
     assert heun.explicit
     assert heun.stages == 2
+
+
+# -- estimates of the error -----------------------------------------------------------------------
+
+
+def _misses(weights, a, order):
+    """What the order conditions of the trees with `order` nodes leave."""
+    return [weights @ _elementary(tree, a) - 1 / _density(tree) for tree in _trees(order)]
+
+
+@pytest.mark.parametrize("name", ESTIMATING)
+def test_an_estimate_is_the_difference_to_a_method_of_lower_order(name):
+    """The weights b + d are those of a method of order p from the same stages, as high as there is one below b's."""
+    a, b, _ = _arrays(name)
+    s, highest = method(name).stages, method(name).estimates[0][1]
+    for d, p in method(name).estimates:
+        assert 1 <= p < method(name).order
+        assert np.abs(d).sum() == pytest.approx(1, rel=1e-14)
+        for order in range(1, p + 1):
+            # As for b alone, see above.
+            assert np.abs(_misses(b + d, a, order)).max() < 1e-13
+        assert np.abs(_misses(b + d, a, p + 1)).max() > 1e-7
+    if highest + 1 < method(name).order:  # all conditions of one order more leave no weights but zero
+        conditions = [_elementary(tree, a) for order in range(1, highest + 2) for tree in _trees(order)]
+        assert np.linalg.matrix_rank(conditions, tol=1e-9) == s
+
+
+@pytest.mark.parametrize("name", ESTIMATING)
+def test_no_estimate_of_a_symmetric_method_is_all_there_is(name):
+    """One is odd about the middle of the step and one even, so that no motion escapes both."""
+    row = method(name)
+    if name.startswith(("gauss", "lobatto")):
+        assert row.symmetric
+        parities = [sign for d, _ in row.estimates for sign in (1, -1) if np.allclose(d, sign * np.array(d)[::-1])]
+        assert sorted(parities) == [-1, 1]
+    else:
+        assert len(row.estimates) == 1 + row.symmetric
+
+
+@pytest.mark.parametrize("name", ["gauss1", "gauss2"])
+def test_few_stages_leave_no_estimate(name):
+    with pytest.raises(ValueError, match=f"{name} has too few stages for an estimate of its error; choose another"):
+        _ = method(name).estimates
+
+
+def _pendulum_step(name, h, state):
+    """One step of the tableau, by fixed-point iteration of all stages: the state at the end, and the estimates."""
+    a, b, _ = _arrays(name)
+    rates = np.zeros((len(b), 2))
+    for _ in range(200):
+        before, stages = rates, state + h * a @ rates
+        rates = np.stack([stages[:, 1], -np.sin(stages[:, 0])], axis=1)
+        if np.array_equal(before, rates):
+            break
+    return state + h * b @ rates, [h * np.array(d) @ rates for d, _ in method(name).estimates]
+
+
+@pytest.mark.parametrize("name", ESTIMATING)
+def test_the_estimate_of_a_pendulum_has_the_order_that_it_claims(name):
+    for which, (_, p) in enumerate(method(name).estimates):
+        h = {1: 0.05, 2: 0.05, 3: 0.05, 4: 0.2, 5: 0.2, 6: 0.4, 7: 0.8}[p]
+        start = np.array([0.4, 0.9])
+        coarse, fine = (np.linalg.norm(_pendulum_step(name, step, start)[1][which]) for step in (h, h / 2))
+        assert fine > 1e-14  # rates of order 1, whose weights add up to nothing, leave 1e-15
+        # Finite steps: the next term of the expansion shifts what is observed by a few tenths.
+        assert np.log2(coarse / fine) == pytest.approx(p + 1, abs=0.4)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-10])
+@pytest.mark.parametrize("name", THRESHOLDS)
+def test_a_step_whose_estimate_is_below_the_threshold_is_right(name, tolerance):
+    """On a pendulum, for the longest such step: its error is below the tolerance, and not out of sight."""
+    thresholds = method(name).thresholds(tolerance)
+    function = lambda t, y: (y[1], -np.sin(y[0]))  # noqa: E731
+    worst = 0.0
+    for start in np.random.default_rng(0).uniform(-2, 2, (5, 2)):
+        h = 1.0
+        while any(np.abs(e).max() > t for e, t in zip(_pendulum_step(name, h, start)[1], thresholds, strict=True)):
+            h *= 0.8
+        end = solve_ivp(function, (0, h), start, "DOP853", rtol=3e-14, atol=1e-15).y[:, -1]
+        worst = max(worst, np.abs(_pendulum_step(name, h, start)[0] - end).max())
+    # The safety that a threshold allows for is a factor of 100, of 5 for Verner; a pendulum needs little of it. The
+    # lower bound is where the reference ends, or the steps for which h = 1 is short.
+    assert min(1e-4 * tolerance, 1e-14) < worst <= tolerance
+
+
+@pytest.mark.parametrize("name", THRESHOLDS)
+def test_thresholds_scale_as_the_estimate_does_with_the_error(name):
+    row, powers = method(name), [p + 1 for _, p in method(name).estimates]
+    usual = row.thresholds(1e-10)
+    ratios = [1e6 ** (power / (row.order + 1)) for power in powers]
+    assert np.divide(row.thresholds(1e-4), usual) == pytest.approx(ratios, rel=1e-12)
+    # With a safety of one, the tolerance is that of the error itself.
+    bold = dataclasses.replace(row, safety=1.0)
+    assert bold.thresholds(1e-10 / row.safety) == pytest.approx(usual, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", THRESHOLDS)
+def test_thresholds_compare_what_is_left_of_the_first_conditions_that_fail(name):
+    """If every derivative is the same power of one rate, of length L: estimate and error both follow from h L."""
+    row = method(name)
+    a, b, _ = _arrays(name)
+    error = np.linalg.norm(_misses(b, a, row.order + 1))
+    for which, (d, p) in enumerate(row.estimates):
+        estimate = np.linalg.norm(np.subtract(_misses(b + d, a, p + 1), _misses(b, a, p + 1)))
+        for reach in (1e-2, 0.1):
+            tolerance = row.safety * error * reach ** (row.order + 1)
+            # A null vector is known to roundings of 1e-16, of sums that leave 1e-7 of their terms.
+            assert row.thresholds(tolerance)[which] == pytest.approx(estimate * reach ** (p + 1), rel=1e-6)
 
 
 # -- steps --------------------------------------------------------------------------------------
