@@ -33,7 +33,7 @@ def motion(state: Array, control: Array, k: Array, out: Array) -> None:
     raise NotImplementedError
 
 
-MAX_FLIGHTS = 10_000  # within one hold, each from event to event or as long as it can be integrated at once
+MAX_FLIGHTS = 1000  # within one hold, each from event to event or as long as it can be integrated at once
 SHORTEST = 2.0**-24  # flight, of the hold
 MAX_ITERATIONS = 100  # bisection alone needs 53
 TIME_TOLERANCE = 1e-13  # of the hold: at 100 rad/s and 0.05 s, the angle is right to 5e-13 rad
