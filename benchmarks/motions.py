@@ -174,14 +174,14 @@ def _relay(rows: int, controls: int, rng: np.random.Generator) -> Law:
 
 
 def _tracking(rows: int, controls: int, rng: np.random.Generator) -> Law:
-    # A joint follows a sinusoid; gains that are critical without the body, and saturated now and then.
+    # A joint follows a sinusoid, saturated now and then; it looks ahead enough for that not to make swings of its own.
     amplitude, frequency = rng.uniform(0.2, 0.7, (rows, controls)), rng.uniform(0.5, 1.5, (rows, controls))
     phase = rng.uniform(0, 2 * np.pi, (rows, controls))
 
     def law(hold: int, angle: Array, rate: Array) -> Array:
         turn = 2 * np.pi * frequency * hold * DT + phase
         wanted, wanted_rate = amplitude * np.sin(turn), 2 * np.pi * frequency * amplitude * np.cos(turn)
-        return np.clip(4 * (wanted - angle) + 0.3 * (wanted_rate - rate), -1, 1)
+        return np.clip(1.5 * (wanted - angle) + 0.25 * (wanted_rate - rate), -1, 1)
 
     return law
 

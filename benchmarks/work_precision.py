@@ -11,8 +11,8 @@ curves  Both mechanisms, eight initial conditions, 10 s; the torque is held for 
 holds   Errors of single holds with default settings, from states that policies reach (`benchmarks.default_errors`).
 runs    Errors after 10 s with default settings, open and closed loop, and how much the motions amplify.
 
-The truth is the formulation with multipliers in long double (`benchmarks.reference`). Tables, a CSV file for each part
-and the figure are written to a folder.
+The truth is the formulation with multipliers in long double (`benchmarks.reference`). A table and a CSV file for
+each part, and the figure, are written to a folder.
 """
 
 from __future__ import annotations
@@ -362,7 +362,7 @@ def main(arguments: Arguments) -> None:
     problems = [problem(name, arguments.conditions, arguments.seconds) for name in arguments.mechanisms]
     console = Console()
     console.width = max(console.width, WIDTH)  # a file or a pipe would get names cut short
-    sheets: list[Sheet] = []
+    sheets: dict[str, list[Sheet]] = {}  # by the name of the file
     notes: list[str] = []
     # What is not timed shares the cores; what is, has them alone.
     context = multiprocessing.get_context("spawn")
@@ -389,25 +389,27 @@ def main(arguments: Arguments) -> None:
             contenders = [*ours(motions.mechanism, arguments.sizes), *peers(arguments.peers)]
             points += curves(motions, (q, qdot), contenders, arguments, skipped)
         notes += [f"skipped: {name} ({reason})" for name, reason in skipped.items()]
-        sheets += curve_sheets(points)
+        sheets["work_precision"] = list(curve_sheets(points))
         write(arguments.out / "work_precision.csv", _curve_rows(points))
         _draw(points, arguments.out / "work_precision.png", notes)
     if "holds" in arguments.parts:
         pairs = zip(results["holds"][::2], results["holds"][1::2], strict=True)
         holds = {name: [*a, *b] for name, (a, b) in zip(arguments.mechanisms, pairs, strict=True)}
-        sheets.append(hold_sheet(holds))
+        sheets["holds"] = [hold_sheet(holds)]
         write(arguments.out / "holds.csv", _hold_rows(holds))
     if "runs" in arguments.parts:
         runs = dict(zip(arguments.mechanisms, results["runs"], strict=True))
-        sheets.append(run_sheet(runs))
+        sheets["runs"] = [run_sheet(runs)]
         write(arguments.out / "runs.csv", _run_rows(runs))
-    for sheet in sheets:
+    for sheet in (sheet for written in sheets.values() for sheet in written):
         console.print(sheet.rich(), markup=False)
     command = shlex.join(["python", "-m", "benchmarks.work_precision", *sys.argv[1:]])
     for note in [*notes, command]:
         console.print(note, markup=False, highlight=False, soft_wrap=True)
-    text = "\n".join([f"`{command}`\n", *(f"{note}\n" for note in notes), *(sheet.markdown() for sheet in sheets)])
-    (arguments.out / "work_precision.md").write_text(text, encoding="utf-8")
+    for name, written in sheets.items():
+        head = [f"`{command}`\n", *(f"{note}\n" for note in notes)]
+        text = "\n".join([*head, *(sheet.markdown() for sheet in written)])
+        (arguments.out / f"{name}.md").write_text(text, encoding="utf-8")
 
 
 def _draw(points: Sequence[Point], path: Path, notes: list[str]) -> None:

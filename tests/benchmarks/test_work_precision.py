@@ -141,6 +141,11 @@ def test_rolling_wheels_have_the_mechanisms_inertia(short):
     wheels.start(q, qdot)
     np.testing.assert_allclose(np.concatenate(wheels.state()), np.concatenate([q, qdot]), rtol=1e-15)
     mujoco.mj_forward(wheels.model, wheels.data)
+    for name in ("phi_wheel", "rear_wheel") if motions.mechanism == "snakeboard" else ("body_wheel", "front_wheel"):
+        body = wheels.model.joint(name).bodyid[0]
+        point, moves = wheels.data.xpos[body] * [1, 1, 0], np.zeros((3, wheels.model.nv))
+        mujoco.mj_jac(wheels.model, wheels.data, moves, None, point, body)
+        np.testing.assert_allclose(moves @ wheels.data.qvel, 0, atol=1e-4)  # m/s: it has sunk in by some µm
     full = np.zeros((wheels.model.nv, wheels.model.nv))
     mujoco.mj_fullM(wheels.model, wheels.data, full)
     places = [wheels.model.joint(name).dofadr[0] for name in data.coordinates]
@@ -297,6 +302,7 @@ def test_runs_are_judged_by_a_reference_that_acts_for_itself(few):
     for one in found.values():
         assert one.errors.shape == one.amplification.shape == (2,)
     assert 0 < found["tracking"].errors.max() < 1e-10
+    assert 0 < found["random bang-bang"].errors.max() < 1e-3  # other random numbers would make it 1
     # Nothing acts on the wheels' angle but the torque: what it begins with stays.
     assert found["random bang-bang"].amplification.min() > 0.99
 

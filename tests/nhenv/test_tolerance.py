@@ -57,7 +57,7 @@ def test_holds_from_hard_states_are_right(name, stops, dt, bare):
         assert "diverged" not in info
         error, turn = _error(env, q, v, env.torque_limits * action)
         # The tolerance is for one flight, which turns no angle by more than 1.5 rad; their errors add up, and positions
-        # amplify those of the heading. Measured: up to 0.3 of this.
+        # amplify those of the heading. Measured: up to 0.15 of this.
         assert error < 3 * TOLERANCE * (1 + turn)
 
 
@@ -138,7 +138,7 @@ def test_a_million_newton_metres_are_right_or_end_the_episode(name, stops, bare)
 def test_rows_beside_one_that_diverges_notice_nothing(name):
     """A torque limit of its own makes one row diverge, at once and in every step after its next reset."""
     limits = np.full(5, 0.3)
-    limits[2] = 1e12
+    limits[2] = 1e9
     arguments = {"num_envs": 5, "backend": "numpy", "joint_limits": False, "autoreset_mode": "SameStep"}
     control = gym.make_vec(_id(name), **arguments).mechanism.controls[-1]
     wild, tame = (
