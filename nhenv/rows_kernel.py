@@ -118,7 +118,7 @@ class RowsKernel(Generator):
         lines = [f"{name} = uint64({STRIDE * i})\n" for name, i in fields.items()]
         lines.append("EIGHT, SIXTEEN = uint64(8), uint64(16)\n")
         plain = {
-            "SUBSTEPS": self.substeps, "JOINTS": len(self.joints),
+            "SUBSTEPS": self.substeps, "STREAMS": 1 if self.varied else 2, "JOINTS": len(self.joints),
             "EVENTS": int(self.events), "KINDS": 2 if self.controlled else 1,
             "N_STATES": len(self.flow.states),
             "N_CONTROLS": len(self.actions), "N_OBSERVATIONS": len(self.observation),
