@@ -10,6 +10,7 @@ Each motion has a step of its own, chosen by the error that the extrapolation sh
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -68,7 +69,7 @@ class Multipliers:
     def __init__(self, mechanism: Mechanism, digits: int | None = None) -> None:
         self.mechanism, self.digits = mechanism, digits
         self._tolerance = TOLERANCE
-        self._ingredients = _ingredients(mechanism.name, repr(mechanism.to_dict()), digits, mechanism=_Box(mechanism))
+        self._ingredients = _ingredients(json.dumps(mechanism.to_dict()), digits)
 
     def acceleration(self, q: ArrayLike, qdot: ArrayLike, u: ArrayLike, params: Mapping[str, ArrayLike]) -> Array:
         """Accelerations (N, n) of motions: q, q̇ (N, n), u (N, m), parameters (N,) or numbers."""
@@ -440,19 +441,6 @@ def _dot(a: Vector, b: Vector) -> Any:
     return total
 
 
-class _Box:
-    """Carries a mechanism past the cache, whose key is the mechanism's data."""
-
-    def __init__(self, mechanism: Mechanism) -> None:
-        self.mechanism = mechanism
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Box)
-
-    def __hash__(self) -> int:
-        return 0
-
-
 @dataclass(frozen=True)
 class _Ingredients:
     """What the equations are made of.
@@ -467,8 +455,8 @@ class _Ingredients:
 
 
 @cache
-def _ingredients(name: str, key: str, digits: int | None, *, mechanism: _Box) -> _Ingredients:
-    m = mechanism.mechanism
+def _ingredients(data: str, digits: int | None) -> _Ingredients:
+    m = Mechanism.from_dict(json.loads(data))
 
     def read(rows: Any) -> list[list[sp.Expr]]:
         return [[m.symbolic(text) for text in row] for row in rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -35,7 +36,7 @@ def multiplier_acceleration(
         drag: coefficients of Rayleigh's function R, which does not act if there are none.
     """
     n, c = mechanism.n, len(mechanism.one_forms)
-    function = _ingredients(mechanism.name, _key(mechanism), mechanism=_Box(mechanism))
+    function = _ingredients(json.dumps(mechanism.to_dict()))
     names = [*mechanism.coordinates, *mechanism.parameters]
     coefficients = [(drag or {}).get(name, 0.0) for name in mechanism.drag]
     numbers = function(*(values[name] for name in names), *coefficients, *qdot)
@@ -55,26 +56,9 @@ def multiplier_acceleration(
     return np.linalg.solve(M, right)
 
 
-class _Box:
-    """Carries a mechanism past the cache, whose key is the mechanism's data."""
-
-    def __init__(self, mechanism: Mechanism) -> None:
-        self.mechanism = mechanism
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Box)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-def _key(mechanism: Mechanism) -> str:
-    return repr(mechanism.to_dict())
-
-
 @cache
-def _ingredients(name: str, key: str, *, mechanism: _Box) -> Any:
-    m = mechanism.mechanism
+def _ingredients(data: str) -> Any:
+    m = Mechanism.from_dict(json.loads(data))
     # Real symbols, for which SymPy differentiates abs.
     real = {s: sp.Symbol(name, real=True) for name, s in m.symbols.items()}
 

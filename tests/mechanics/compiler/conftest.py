@@ -25,6 +25,36 @@ def execute():
 
 
 @pytest.fixture(scope="session")
+def two_streams(execute):
+    """Assert that two streams are one twice to the last bit, and so is a step that is given what is carried."""
+
+    def check(equations, program, flow, tableau, **options):
+        held, backend = equations.controls, BACKENDS["numba"]
+        carried = program.carried(flow, tableau)
+        assert carried
+        source = [
+            program.step_function("once", flow, tableau, 1, held, backend, **options),
+            program.step_function("carrying", flow, tableau, 1, held, backend, carried, **options),
+            program.step_function("twice", flow, tableau, 1, held, backend, carried, streams=2, **options),
+            program.carry_function("carry", flow, carried, backend),
+            program.constants_function("constants", [sp.Symbol(p) for p in equations.mechanism.parameters]),
+        ]
+        functions = execute("\n\n".join(source), backend.name)
+        k = np.array(functions["constants"](list(equations.mechanism.parameters.values())), dtype=float)
+        rng = np.random.default_rng(8)
+        states = rng.uniform(-1, 1, (2, len(flow.states))).tolist()
+        controls = rng.uniform(-1, 1, (2, len(held))).tolist()
+        one, other = (functions["once"](0.05, *s, *u, k) for s, u in zip(states, controls, strict=True))
+        assert one != other
+        kept = [functions["carry"](*s, k) for s in states]
+        assert functions["carrying"](0.05, *states[0], *kept[0], *controls[0], k) == one
+        both = functions["twice"](0.05, *states[0], *kept[0], *controls[0], 0.05, *states[1], *kept[1], *controls[1], k)
+        assert both == (*one, *other)
+
+    return check
+
+
+@pytest.fixture(scope="session")
 def stepper(execute):
     """Generate one step of a method for a system: (flow, function (h, state, held) -> state).
 

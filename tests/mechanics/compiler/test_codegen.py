@@ -290,36 +290,13 @@ def test_sums_of_products_are_fused_and_right(execute):
 
 
 @pytest.mark.parametrize("name", ["rk4", "verner9"])
-def test_two_streams_are_twice_one(equations, name, execute):
+def test_two_streams_are_twice_one(equations, name, two_streams):
     """To the last bit, and the same is true of what is carried from the step before."""
     rates = dict(zip(equations.coordinates, equations.velocity, strict=True))
     rates |= dict(zip(equations.pseudo_velocities, equations.acceleration, strict=True))
     flow = analyse(rates, list(rates))
-    parameters = [sp.Symbol(p) for p in equations.mechanism.parameters]
-    program = Program(integrated(flow), parameters)
-    held, backend, tableau = equations.controls, BACKENDS["numba"], method(name)
-    carried = program.carried(flow, tableau)
-    assert carried
-    source = "\n\n".join(
-        [
-            program.step_function("once", flow, tableau, 1, held, backend),
-            program.step_function("carrying", flow, tableau, 1, held, backend, carried),
-            program.step_function("twice", flow, tableau, 1, held, backend, carried, streams=2),
-            program.carry_function("carry", flow, carried, backend),
-            program.constants_function("constants", parameters),
-        ]
-    )
-    functions = execute(source, backend.name)
-    k = np.array(functions["constants"](list(equations.mechanism.parameters.values())), dtype=float)
-    rng = np.random.default_rng(8)
-    states = rng.uniform(-1, 1, (2, len(flow.states))).tolist()
-    controls = rng.uniform(-1, 1, (2, len(held))).tolist()
-    one, other = (functions["once"](0.05, *s, *u, k) for s, u in zip(states, controls, strict=True))
-    assert one != other
-    kept = [functions["carry"](*s, k) for s in states]
-    assert functions["carrying"](0.05, *states[0], *kept[0], *controls[0], k) == one
-    both = functions["twice"](0.05, *states[0], *kept[0], *controls[0], 0.05, *states[1], *kept[1], *controls[1], k)
-    assert both == (*one, *other)
+    program = Program(integrated(flow), [sp.Symbol(p) for p in equations.mechanism.parameters])
+    two_streams(equations, program, flow, method(name))
 
 
 def test_nothing_is_carried_where_a_step_does_not_begin_with_a_stage(equations):

@@ -5,7 +5,6 @@ import pytest
 import sympy as sp
 
 import mechanics
-from mechanics.compiler.backends import BACKENDS
 from mechanics.compiler.codegen import Program, integrated
 from mechanics.compiler.dataflow import analyse
 from mechanics.compiler.integrators import method
@@ -145,32 +144,11 @@ def test_states_may_be_arrays(stepper, execute):
 
 
 @pytest.mark.parametrize("tolerance", [np.inf, 1e-10])
-def test_two_streams_are_twice_one(steps, tolerance, execute):
+def test_two_streams_are_twice_one(steps, tolerance, two_streams):
     """To the last bit, and the same is true of what is carried from the step before."""
     equations, flow = steps.equations, analyse(steps.rates, list(steps.rates))
-    parameters = list(equations.parameters)
-    program = Program({**integrated(flow), **steps.energy}, parameters)
-    held, backend, tableau = equations.controls, BACKENDS["numba"], method("rk4")
-    carried = program.carried(flow, tableau)
-    options = {"tolerance": tolerance, "speeds": equations.pseudo_velocities}
-    source = [
-        program.step_function("once", flow, tableau, 1, held, backend, **options),
-        program.step_function("carrying", flow, tableau, 1, held, backend, carried, **options),
-        program.step_function("twice", flow, tableau, 1, held, backend, carried, streams=2, **options),
-        program.carry_function("carry", flow, carried, backend),
-        program.constants_function("constants", parameters),
-    ]
-    functions = execute("\n\n".join(source), backend.name)
-    k = np.array(functions["constants"](list(steps.mechanism.parameters.values())), dtype=float)
-    rng = np.random.default_rng(8)
-    states = rng.uniform(-1, 1, (2, len(flow.states))).tolist()
-    controls = rng.uniform(-1, 1, (2, len(held))).tolist()
-    one, other = (functions["once"](0.05, *s, *u, k) for s, u in zip(states, controls, strict=True))
-    assert one != other
-    kept = [functions["carry"](*s, k) for s in states]
-    assert functions["carrying"](0.05, *states[0], *kept[0], *controls[0], k) == one
-    both = functions["twice"](0.05, *states[0], *kept[0], *controls[0], 0.05, *states[1], *kept[1], *controls[1], k)
-    assert both == (*one, *other)
+    program = Program({**integrated(flow), **steps.energy}, equations.parameters)
+    two_streams(equations, program, flow, method("rk4"), tolerance=tolerance, speeds=equations.pseudo_velocities)
 
 
 def test_a_step_of_several_keeps_the_energy_in_each(steps):
