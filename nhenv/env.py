@@ -68,6 +68,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | Forward | cosine and sine of the heading | |
     | Velocity | cosine and sine of the heading; commanded speed | 1, 1; m/s |
     | Goal | direction of the goal, ahead and to the left (a unit vector in the body's axes); its distance | 1, 1; 2 m |
+    | Turn | where the start is, ahead and to the left; cosine and sine of the angle still to turn | m; 1, 1 |
+    | Park | where the place is, ahead and to the left; cosine and sine of the angle still to turn | m; 1, 1 |
 
     A mechanism that declares no observation shows, in SI units: each shape coordinate that anything
     depends on (over its stop if it has one, as cosine and sine if a full turn changes nothing, else its
@@ -81,12 +83,16 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | task | target | drawn |
     |---|---|---|
     | Velocity | `commanded_speed` | uniform in 0.2 to 1 m/s |
-    | Goal | `goal_x`, `goal_y` | from the origin, `start_distance` uniform in 1 to 3 m, `start_bearing` in ±π |
+    | Goal | `goal_x`, `goal_y` | seen from the start, `start_distance` uniform in 1 to 3 m, `start_bearing` in ±π |
+    | Turn | `target_heading` | `turn_size` uniform in π/4 to π, to the left or right as `turn_side` in ±1 is signed |
+    | | `start_x`, `start_y` | where the episode starts |
+    | Park | `place_x`, `place_y` | `park_size` uniform in 0.3 to 1 m, to the side of the start; `park_side` as above |
+    | | `target_heading` | the heading at the start |
 
     ## Rewards
     A sum of terms, all reported in `info`. s is the mechanism's own forward: +1 for the snakeboard, the
     sign of l_1 I_2 - l_2 I_1 for the roller racer (-1 by default: a heavy body is driven away from its
-    light front link). d is the distance to the goal.
+    light front link). d is the distance to the goal, start or place, e the angle still to turn, in ±π.
 
     | task | term | value |
     |---|---|---|
@@ -96,11 +102,18 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | Goal | `reward_progress` | `progress_reward_weight * (d_before - d) / dt` |
     | | `reward_time` | `-time_cost_weight` |
     | | `reward_goal` | `goal_reward_weight` on the step that reaches the goal, else 0 |
+    | Turn | `reward_heading` | `-heading_cost_weight * abs(e) / pi` |
+    | | `reward_offset` | `-offset_cost_weight * d` |
+    | | `reward_arrival` | `arrival_reward_weight * exp(-(e/heading_tolerance)**2)` |
+    | Park | `reward_progress` | `progress_reward_weight * (d_before - d) / dt` |
+    | | `reward_near` | `near_reward_weight * exp(-(d/0.2)**2) * (0.25 + 0.75*((1 + cos(e))/2)**2)` |
+    | | `reward_arrival` | `arrival_reward_weight * exp(-(d/offset_tolerance)**2 - (e/heading_tolerance)**2)` |
     | all | `reward_ctrl` | `-ctrl_cost_weight * mean(action**2)` |
 
     `info` also has, for Forward, `x_position` and `x_velocity`, the mean over the step; for Velocity,
     `x_velocity` and `y_velocity` at its end; for Goal, `x_position`, `y_position`, `goal_distance` d, and
-    `is_success`, 1.0 on the step that reaches the goal, else 0.0.
+    `is_success`, 1.0 on the step that reaches the goal, else 0.0; for Turn and Park, `heading_error` e, `offset` d, and
+    `is_success`, 1.0 after a step with |e| < `heading_tolerance` and d < `offset_tolerance`, else 0.0.
 
     Velocity asks for the velocity (s * commanded_speed, 0) in the plane, at the end of each step: along
     the x axis, not along the heading, the way in which the gaits drive the mechanism.
@@ -111,9 +124,9 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     the order of `env.unwrapped.mechanism.coordinates`; a velocity must satisfy the rolling constraints.
 
     ## Episode end
-    Truncated after 300 steps (by the TimeLimit that `gym.make` adds). Terminated in Goal with the step
-    after which d < `goal_radius`; in every task if the state stops being finite: then
-    `info["diverged"]` is True and the last finite observation is returned.
+    Truncated after 300 steps, Turn after 160 and Park after 240 (by the TimeLimit that `gym.make`
+    adds). Terminated in Goal with the step after which d < `goal_radius`; in every task if the state
+    stops being finite: then `info["diverged"]` is True and the last finite observation is returned.
 
     ## Arguments
     Args:
@@ -145,7 +158,10 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         render_mode: None; these environments do not draw.
         **weights: the task's weights. Forward: `forward_reward_weight=1.0`. Velocity: `velocity_cost_weight=2.0`,
             `sideways_cost_weight=0.2`. Goal: `progress_reward_weight=1.0`, `time_cost_weight=0.5`,
-            `goal_reward_weight=5.0`, `goal_radius=0.15`. All: `ctrl_cost_weight=0.02`.
+            `goal_reward_weight=5.0`, `goal_radius=0.15`. Turn: `heading_cost_weight=1.0`, `offset_cost_weight=0.5`,
+            `arrival_reward_weight=0.5`, `heading_tolerance=0.15`, `offset_tolerance=0.15`. Park:
+            `progress_reward_weight=1.0`, `near_reward_weight=1.0`, `arrival_reward_weight=1.0`,
+            `heading_tolerance=0.15`, `offset_tolerance=0.1`. All: `ctrl_cost_weight=0.02`.
 
     ## Version history
     * v0: initial version.
@@ -180,17 +196,20 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             if key not in ("q", "qdot", "target"):
                 raise ValueError(f"reset options: {unknown_name('option', str(key), ('q', 'qdot', 'target'))}")
         given = self._configuration.targets_given(options) if options else {}
+        values = [given.get(name, math.nan) for name in self._scene.givable]
+        start = None
+        if options and "q" in options:
+            start = self._configuration.state_given(options, "q")
+            self._configuration.check_stops(start)
+            values[len(self.task.targets) :] = start[self._scene.start_places]
         drawn = self.np_random.random(self._scene.draws)
-        values = [given.get(name, math.nan) for name in self.task.targets]
         begun = self._scene.kernel.begin(drawn, self.reset_noise_scale, np.array(values), self._constants(self._blank))
         q, v = np.zeros(self.mechanism.n), np.zeros(self.mechanism.rank)
         q[self._noisy] = begun[: len(self._noisy)]
-        if options:
-            if "q" in options:
-                q = self._configuration.state_given(options, "q")
-                self._configuration.check_stops(q)
-            if "qdot" in options:
-                v = self._model.feasible(q, self._configuration.state_given(options, "qdot"))
+        if start is not None:
+            q = start
+        if options and "qdot" in options:
+            v = self._model.feasible(q, self._configuration.state_given(options, "qdot"))
         self._memory, self._start = self._blank.copy(), (q, v)
         self._targets = dict(zip(self._scene.targets, map(float, begun[len(self._noisy) :]), strict=True))
         self._scene.put(self._memory, q, v)

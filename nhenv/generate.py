@@ -25,7 +25,7 @@ from mechanics.geometry.reduction import ReducedEquations, derive
 from mechanics.geometry.symmetry import planar_symmetry
 from nhenv.observation import default_observation
 from nhenv.scene import Scene
-from nhenv.tasks import Task
+from nhenv.tasks import START, Task
 
 __all__ = ["Generator", "included", "items", "label"]
 
@@ -121,7 +121,7 @@ class Generator:
         """Targets that follow from those before them, as expressions."""
         task = self.scene.task
         texts = task.targets if task else {}
-        scope = {name: sp.Symbol(name) for name in texts}
+        scope = {name: sp.Symbol(name) for name in texts} | {name: _at_start(name) for name in START}
         return {
             f"target:{n}": _read(task, "targets", t, scope) for n, t in texts.items() if task and isinstance(t, str)
         }
@@ -237,7 +237,12 @@ class Generator:
         rules = task.targets if task else {}
         parts, lines = [], [f"_q_{name} = -_noise + (_noise + _noise)*_u{i}" for i, name in enumerate(noisy)]
         draw = len(noisy)
-        known: list[str] = []
+        known = [_at_start(name).name for name in (task.start if task else ())]
+        # Where an episode starts, unless that is given, is what was drawn, or else the origin.
+        places = dict(zip(START, self.scene.mechanism.fibre, strict=False))
+        for role, name in zip(task.start if task else (), known, strict=True):
+            drawn = f"_q_{places[role]}" if places[role] in noisy else "0.0"
+            lines.append(f"{name} = either(_given_{role}, {drawn})")
         for name, rule in rules.items():
             if isinstance(rule, str):
                 arguments = [sp.Symbol(other) for other in known]
@@ -251,7 +256,8 @@ class Generator:
         # Coordinates, then the targets that something depends on.
         kept = [f"_q_{name}" for name in noisy] + [target.name for target in self.targets]
         lines.append(f"return ({''.join(f'{name}, ' for name in kept)})")
-        arguments_ = ", ".join((*(f"_u{i}" for i in range(draw)), "_noise", *(f"_given_{n}" for n in rules), "_k"))
+        given = (f"_given_{name}" for name in self.scene.givable)
+        arguments_ = ", ".join((*(f"_u{i}" for i in range(draw)), "_noise", *given, "_k"))
         body = textwrap.indent("\n".join(lines), "    ")
         return [*parts, f"{backend.decorator}def start({arguments_}):\n{body}\n"]
 
@@ -290,6 +296,11 @@ class Generator:
     def advance(self, new: str, state: str, held: str) -> str:
         """Lines that advance a state by `h`, through all substeps, and say whether it is `right`."""
         return f"{new}, right = advance_states(h, {state}, {held}k)"
+
+
+def _at_start(role: str) -> sp.Symbol:
+    """Where an episode starts: x, y or heading."""
+    return sp.Symbol(f"_start_{role}")
 
 
 def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) -> dict[str, sp.Expr]:

@@ -58,8 +58,8 @@ class OneKernel(Generator):
 
     def _begin(self) -> str:
         """`begin`: what an episode begins with, from uniform numbers; `look`: what is observed of a memory."""
-        place, rules = self._places(), len(self.scene.task.targets) if self.scene.task else 0
-        given = [items("given", rules)] * bool(rules)
+        place, givable = self._places(), len(self.scene.givable)
+        given = [items("given", givable)] * bool(givable)
         drawn = [items("drawn", self.scene.draws)] * bool(self.scene.draws)
         values = ", ".join((*drawn, "noise", *given, "k"))
         seen = [items("memory", len(self.flow.states), place["state"])]

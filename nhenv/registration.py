@@ -58,14 +58,17 @@ def register(mechanism: MechanismLike, tasks: Iterable[TaskLike] | None = None) 
         mechanism: a `Mechanism`, its plain data, or the path of a file that has them. Without a `fibre`, position and
             heading are looked for: coordinates x, y and an angle by which the mechanism may be displaced in the plane
             without anything changing.
-        tasks: tasks or their names; None for every task of this package that fits.
+        tasks: tasks or their names; None for every task of this package that fits, but for those that take a mechanism
+            which comes to rest in any pose: these have to be asked for.
 
     Raises:
         ValueError: no task fits, or not one of those asked for; or an id is another mechanism's already.
     """
     mechanism = in_the_plane(as_mechanism(mechanism))
     if tasks is None:
-        chosen = [task for task in TASKS if unfit(mechanism, task) is None] or TASKS[:1]
+        any_pose = mechanism.name in mechanics.names(any_pose=True)
+        fitting = [task for task in TASKS if unfit(mechanism, task) is None]
+        chosen = [task for task in fitting if any_pose or not task.any_pose] or TASKS[:1]
     elif isinstance(tasks, str | Mapping | Task):
         raise TypeError(f"tasks must be several tasks or names, such as ['Forward'], got {tasks!r}")
     else:
@@ -86,8 +89,8 @@ def register(mechanism: MechanismLike, tasks: Iterable[TaskLike] | None = None) 
 
 def register_catalogue() -> None:
     """Register every task for every mechanism of the catalogue that moves in the plane by controls of its own."""
-    for mechanism in mechanics.names(in_the_plane=True):
-        for task in TASKS:
+    for task in TASKS:
+        for mechanism in mechanics.names(in_the_plane=True, any_pose=task.any_pose):
             _register(environment_id(mechanism, task), mechanism, task.name, task.max_episode_steps)
 
 

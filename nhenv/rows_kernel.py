@@ -36,7 +36,6 @@ class RowsKernel(Generator):
         states = [state.name for state in self.flow.states]
         controls = [control.name for control in self.equations.controls]
         angles = [angle.name for angle, _ in self.joints]
-        rules = list(scene.task.targets) if scene.task else []
         self.carried = self.program.carried(self.flow, self.method)
         carried = list(self.carried)
         own = {"k": [constant.name for constant in self.program.constants], "limit": controls, "stop": angles}
@@ -63,7 +62,7 @@ class RowsKernel(Generator):
         departure = {"y": states} if self.controlled else {}
         self.scratch = _places({**motion, **judged, **departure, **{name: [""] for name in kept}}, "w")
         shared = {**({} if varied else own), **{name: [""] for name in ("dt", "noise", "max_steps", "mode")}}
-        shared["nothing"] = rules
+        shared["nothing"] = list(scene.givable)
         self.shared = _places(shared, "n")
 
     def module(self) -> str:
@@ -114,7 +113,6 @@ class RowsKernel(Generator):
     def _constants(self) -> list[str]:
         """Places of the fields: unsigned in loops, where a negative one would have to be allowed for; else plain."""
         fields = {**self.lasting, **self.scratch}
-        rules = self.scene.task.targets if self.scene.task else ()
         lines = [f"{name} = uint64({STRIDE * i})\n" for name, i in fields.items()]
         lines.append("EIGHT, SIXTEEN = uint64(8), uint64(16)\n")
         plain = {
@@ -125,7 +123,7 @@ class RowsKernel(Generator):
             "STATE": 0, "STEPS": STRIDE * self.lasting["steps__p"], "OVER": STRIDE * self.lasting["over__p"],
             "DT": self.shared["dt__n"], "MAX_STEPS": self.shared["max_steps__n"], "MODE": self.shared["mode__n"],
             "RUNNING": RUNNING, "DIVERGED": DIVERGED, "TERMINATED": TERMINATED,
-            "NOTHING": len(self.shared) - len(rules),
+            "NOTHING": len(self.shared) - len(self.scene.givable),
             "NEXT_STEP": rows.NEXT_STEP, "SAME_STEP": rows.SAME_STEP,
         }  # fmt: skip
         first = {"X": "x", "CONTROL": "u", "BAD": "bad", "HIT": "hit", "STATUS": "status"}
@@ -608,9 +606,8 @@ class RowsKernel(Generator):
 
     def _start_row(self) -> str:
         """The beginning of an episode: the next numbers of the row's own stream, and nothing else at random."""
-        rules = list(self.scene.task.targets) if self.scene.task else []
         drawn = [f"_u{i}" for i in range(self.scene.draws)]
-        given = [f"given[{i}]" for i in range(len(rules))]
+        given = [f"given[{i}]" for i in range(len(self.scene.givable))]
         values = _listed((*drawn, f"numbers[{self.shared['noise__n']}]", *given))
         states, noisy = [state.name for state in self.flow.states], self.scene.noisy
         lines = [

@@ -27,7 +27,7 @@ from mechanics.compiler import kernels
 from mechanics.compiler.integrators import method_names
 from mechanics.expressions import unknown_name
 from mechanics.mechanism import Mechanism
-from nhenv.tasks import Task
+from nhenv.tasks import START, Task
 
 __all__ = ["BACKENDS", "BAD_ACTION", "DIVERGED", "HISTORY_FULL", "LARGEST", "RUNNING", "TERMINATED", "Scene"]
 
@@ -101,6 +101,17 @@ class Scene:
     def noisy(self) -> tuple[str, ...]:
         """Coordinates that are random at reset: the joints with stops, or else the heading."""
         return tuple(self.mechanism.joint_limits) or self.mechanism.fibre[2:]
+
+    @cached_property
+    def givable(self) -> tuple[str, ...]:
+        """What the beginning of an episode takes as given: targets, then what they need of the pose at the start."""
+        return (*self.task.targets, *self.task.start) if self.task else ()
+
+    @cached_property
+    def start_places(self) -> list[int]:
+        """Coordinates that the last of `givable` are."""
+        roles = dict(zip(START, self.mechanism.fibre, strict=False))
+        return [self.mechanism.coordinates.index(roles[name]) for name in (self.task.start if self.task else ())]
 
     @cached_property
     def draws(self) -> int:

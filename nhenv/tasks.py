@@ -16,7 +16,7 @@ NAME_before     a coordinate, x, y, heading or a DEFINITION made of coordinates 
 terminated      1 if the task ends the episode with this step, else 0; in rewards and info only
 
 so that any mechanism with a pose in the plane can be given any task, and a kernel computes only
-what the expressions reach.
+what the expressions reach. In the rule of a TARGET, x, y and heading are where the episode starts.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ from typing import Any
 from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name
 from mechanics.mechanism import Mechanism
 
-__all__ = ["POSE", "TASKS", "Task", "get"]
+__all__ = ["POSE", "START", "TASKS", "Task", "get"]
 
 # Names that a mechanism has if it declares a fibre.
 POSE = (
     "x", "y", "heading", "x_dot", "y_dot", "heading_dot", "x_before", "y_before", "heading_before", "speed", "drift",
 )  # fmt: skip
+START = ("x", "y", "heading")
 _WORDS = ("effort", "forward", "dt")
 
 
@@ -50,10 +51,11 @@ class Task:
         info: info key -> expression, reported and not rewarded.
         weights: weight -> default; each is an argument of the environment.
         targets: name -> (low, high), drawn uniformly at reset in this order, or an expression in the targets
-            before it; a number for the whole episode.
+            before it and in x, y and heading at the start; a number for the whole episode.
         definitions: shorthand -> expression; one may use those before it.
         terminated: expression; the episode ends with the step after which it is positive. None: it never does.
         max_episode_steps: steps after which the registered environment truncates.
+        any_pose: whether it takes a mechanism that can be brought to rest in any pose nearby, as not all can.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Task:
     definitions: Mapping[str, str] = field(default_factory=dict)
     terminated: str | None = None
     max_episode_steps: int
+    any_pose: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not re.fullmatch(r"[A-Z][A-Za-z0-9]*", self.name):
@@ -74,12 +77,14 @@ class Task:
             if not isinstance(rule, str) and not _is_interval(rule):
                 raise ValueError(
                     f"task {self.name!r}: target {name!r} must be (low, high), two finite numbers in this order, or an "
-                    f"expression in the targets before it; got {rule!r}"
+                    f"expression in the targets before it and in x, y and heading at the start; got {rule!r}"
                 )
         self._check_expressions()
         steps = self.max_episode_steps
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
             raise ValueError(f"task {self.name!r}: max_episode_steps must be a positive whole number, got {steps!r}")
+        if not isinstance(self.any_pose, bool):
+            raise ValueError(f"task {self.name!r}: any_pose must be True or False, got {self.any_pose!r}")
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Task:
@@ -101,8 +106,14 @@ class Task:
         known |= {f"{name}_before" for name in (*mechanism.coordinates, *self.definitions)}
         known |= set(POSE) if mechanism.fibre else set()
         known |= {"terminated"} if self.terminated is not None else set()
-        used = {name for _, text in self._texts() for name in names_in(text)}
+        used = {name for _, text in self._texts() for name in names_in(text)} | {*self.start}
         return tuple(sorted(used - known))
+
+    @property
+    def start(self) -> tuple[str, ...]:
+        """What of the pose at the start, of x, y and heading, the targets depend on."""
+        used = {name for rule in self.targets.values() if isinstance(rule, str) for name in names_in(rule)}
+        return tuple(name for name in START if name in used)
 
     def _texts(self) -> Iterable[tuple[str, str]]:
         """Every expression, with the word for where it stands."""
@@ -131,8 +142,8 @@ class Task:
             earlier: list[str] = []
             for name, rule in self.targets.items():
                 kind = f"targets, {name}"
-                for unknown in (names_in(rule) if isinstance(rule, str) else set()) - set(earlier):
-                    raise ExpressionError(unknown_name("target", unknown, earlier))
+                for unknown in (names_in(rule) if isinstance(rule, str) else set()) - {*earlier, *START}:
+                    raise ExpressionError(unknown_name("target", unknown, (*earlier, *START)))
                 earlier.append(name)
             for kind, text in self._texts():  # noqa: B007 (named in the error)
                 names_in(text)
@@ -203,8 +214,8 @@ TASKS: tuple[Task, ...] = (
         targets={
             "start_distance": (1.0, 3.0),
             "start_bearing": (-math.pi, math.pi),
-            "goal_x": "start_distance*cos(start_bearing)",
-            "goal_y": "start_distance*sin(start_bearing)",
+            "goal_x": "x + start_distance*cos(heading + start_bearing)",
+            "goal_y": "y + start_distance*sin(heading + start_bearing)",
         },
         definitions={
             "to_goal_x": "goal_x - x",
@@ -213,6 +224,96 @@ TASKS: tuple[Task, ...] = (
         },
         terminated="goal_radius - to_goal",
         max_episode_steps=300,
+    ),
+    # Paid for being there, not for the way: it is to turn, and to come to rest, on the spot.
+    Task(
+        name="Turn",
+        observation={
+            "start_ahead": "cos(heading)*to_start_x + sin(heading)*to_start_y",
+            "start_left": "cos(heading)*to_start_y - sin(heading)*to_start_x",
+            "cos_to_turn": "cos(target_heading - heading)",
+            "sin_to_turn": "sin(target_heading - heading)",
+        },
+        reward={
+            "reward_heading": "-heading_cost_weight*abs(to_turn)/pi",
+            "reward_offset": "-offset_cost_weight*to_start",
+            "reward_arrival": "arrival_reward_weight*exp(-(to_turn/heading_tolerance)**2)",
+            "reward_ctrl": "-ctrl_cost_weight*effort",
+        },
+        info={
+            "heading_error": "to_turn",
+            "offset": "to_start",
+            "is_success": "(1 + sign(heading_tolerance - abs(to_turn)))*(1 + sign(offset_tolerance - to_start))/4",
+        },
+        weights={
+            "heading_cost_weight": 1.0,
+            "offset_cost_weight": 0.5,
+            "arrival_reward_weight": 0.5,
+            "ctrl_cost_weight": 0.02,
+            "heading_tolerance": 0.15,
+            "offset_tolerance": 0.15,
+        },
+        targets={
+            "turn_size": (math.pi / 4, math.pi),
+            "turn_side": (-1.0, 1.0),
+            "target_heading": "heading + sign(turn_side)*turn_size",
+            "start_x": "x",
+            "start_y": "y",
+        },
+        definitions={
+            "to_start_x": "start_x - x",
+            "to_start_y": "start_y - y",
+            "to_start": "sqrt(to_start_x**2 + to_start_y**2)",
+            "to_turn": "atan2(sin(target_heading - heading), cos(target_heading - heading))",
+        },
+        max_episode_steps=160,
+        any_pose=True,
+    ),
+    # The heading counts near the place only; if it counted everywhere, doing nothing would be the best.
+    Task(
+        name="Park",
+        observation={
+            "place_ahead": "cos(heading)*to_place_x + sin(heading)*to_place_y",
+            "place_left": "cos(heading)*to_place_y - sin(heading)*to_place_x",
+            "cos_to_turn": "cos(target_heading - heading)",
+            "sin_to_turn": "sin(target_heading - heading)",
+        },
+        reward={
+            "reward_progress": "progress_reward_weight*(to_place_before - to_place)/dt",
+            "reward_near": "near_reward_weight*exp(-(to_place/0.2)**2)"
+            "*(0.25 + 0.75*((1 + cos(target_heading - heading))/2)**2)",
+            "reward_arrival": "arrival_reward_weight"
+            "*exp(-(to_place/offset_tolerance)**2 - (to_turn/heading_tolerance)**2)",
+            "reward_ctrl": "-ctrl_cost_weight*effort",
+        },
+        info={
+            "heading_error": "to_turn",
+            "offset": "to_place",
+            "is_success": "(1 + sign(heading_tolerance - abs(to_turn)))*(1 + sign(offset_tolerance - to_place))/4",
+        },
+        weights={
+            "progress_reward_weight": 1.0,
+            "near_reward_weight": 1.0,
+            "arrival_reward_weight": 1.0,
+            "ctrl_cost_weight": 0.02,
+            "heading_tolerance": 0.15,
+            "offset_tolerance": 0.1,
+        },
+        targets={
+            "park_size": (0.3, 1.0),
+            "park_side": (-1.0, 1.0),
+            "place_x": "x - sign(park_side)*park_size*sin(heading)",
+            "place_y": "y + sign(park_side)*park_size*cos(heading)",
+            "target_heading": "heading",
+        },
+        definitions={
+            "to_place_x": "place_x - x",
+            "to_place_y": "place_y - y",
+            "to_place": "sqrt(to_place_x**2 + to_place_y**2)",
+            "to_turn": "atan2(sin(target_heading - heading), cos(target_heading - heading))",
+        },
+        max_episode_steps=240,
+        any_pose=True,
     ),
 )
 

@@ -160,13 +160,15 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         if not (self._started or mask.all()):
             raise ResetNeeded("the first reset must be of all rows; leave out the option 'reset_mask'")
         chosen = np.flatnonzero(mask)
-        given = np.full((self.num_envs, len(self.task.targets)), np.nan)
+        given = np.full((self.num_envs, len(self._configuration.scene.givable)), np.nan)
         for name, values in self._configuration.targets_given(options, mask).items():
             given[mask, list(self.task.targets).index(name)] = values
         seeds = vector_input.seeds(seed, chosen, self.num_envs)
         # Nothing of the present episodes is changed before all is known to be right.
         streams = self._new_streams(seeds)
         q, v = self._state_given(options, mask, streams, given)
+        if "q" in options and q is not None:
+            given[mask, len(self.task.targets) :] = q[..., self._configuration.scene.start_places]
         self._kernel.begin_rows(self._memory.blocks, streams, self._numbers, mask, given)
         self._streams[:] = streams
         for row, number in seeds.items():
@@ -343,7 +345,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         kernel, configuration = self._kernel, self._configuration
         steps = np.inf if self.max_episode_steps is None else self.max_episode_steps
         shared = [configuration.dt, configuration.reset_noise_scale, steps, _MODES[self.autoreset_mode]]
-        shared += [np.nan] * len(self.task.targets)
+        shared += [np.nan] * len(configuration.scene.givable)
         if self._parameters.varied:
             return np.array(shared, float)
         numbers = configuration.numbers(configuration.params, configuration.drag)

@@ -28,14 +28,33 @@ _IN_THE_PLANE = (
     "falling_rolling_disk",
     "wheeled_inverted_pendulum",
 )
+# Those of them that come to rest in any pose nearby: locally configuration controllable from rest (section 6 of the
+# paper); the differential drive's pose is, though its wheels' angles are not independent of it.
+_ANY_POSE = (
+    "snakeboard",
+    "chaplygin_sleigh",
+    "vertical_rolling_disk",
+    "differential_drive",
+    "car",
+    "trailer",
+    "snake",
+    "planar_rigid_body",
+)
 _OTHERS = (
     "suslov",
     "chaplygin_sphere",
 )
 
 
-def names(*, in_the_plane: bool = False) -> tuple[str, ...]:
-    """Names of the mechanisms in the catalogue, or only of those that can be steered through the plane."""
+def names(*, in_the_plane: bool = False, any_pose: bool = False) -> tuple[str, ...]:
+    """Names of the mechanisms in the catalogue.
+
+    Args:
+        in_the_plane: only those that can be steered through the plane.
+        any_pose: only those of these that can be brought to rest in any pose nearby, from any.
+    """
+    if any_pose:
+        return _ANY_POSE
     return _IN_THE_PLANE if in_the_plane else (*_IN_THE_PLANE, *_OTHERS)
 
 

@@ -647,6 +647,18 @@ def test_long_formulas_are_refused_and_not_needed(monkeypatch):
     assert "too long" in str(analysis)
 
 
+# Its wheels' angles follow its pose up to a constant, so its configuration is not accessible; its pose is.
+ONLY_THE_POSE = {"differential_drive"}
+
+
+@pytest.mark.slow
+def test_the_catalogue_says_what_comes_to_rest_in_any_pose():
+    """What falls over does not come to rest; of the others the conditions of section 6 decide."""
+    free = [m for name in mechanics.names(in_the_plane=True) if (m := mechanics.get(name)).potential == "0"]
+    controllable = {m.name for m in free if analyse(m).generic.controllable}
+    assert set(mechanics.names(any_pose=True)) == controllable | ONLY_THE_POSE
+
+
 def test_the_printout(racer):
     text = str(racer)
     for part in ("u_psi acts along X2", "accessible where none of these is zero: ", "configuration accessible: yes"):

@@ -162,7 +162,7 @@ def test_the_goal_ends_the_episode_and_is_paid_once(mechanism, make_task, radius
     nothing = np.zeros(env.action_space.shape, np.float32)
     q, qdot = _rolling(env, 1.0, heading=0.6)
     start = 1.02
-    env.reset(options={"q": q, "qdot": qdot, "target": {"start_distance": start, "start_bearing": 0.6}})
+    env.reset(options={"q": q, "qdot": qdot, "target": {"start_distance": start, "start_bearing": 0.0}})
     steps = next(k for k in range(100) if start - 0.05 * k < radius)
     for k in range(1, steps + 1):
         _, reward, terminated, truncated, info = env.step(nothing)
@@ -229,6 +229,114 @@ def test_states_that_the_goal_does_not_need_are_known(make_task, actions):
         # The same formulas, whose terms may be added in another order; thirty holds.
         assert env.q == pytest.approx(envs[0].q, rel=1e-11, abs=1e-12)
         assert env.qdot == pytest.approx(envs[0].qdot, rel=1e-11, abs=1e-12)
+
+
+# -- Turn and Park ------------------------------------------------------------------------------
+
+
+def _apart(env, target_heading):
+    """What is left to turn, by complex numbers."""
+    return np.angle(np.exp(1j * (target_heading - env.q[2])))
+
+
+def test_reward_and_observation_of_the_turn_task(make_task, actions):
+    env = make_task("snakeboard", "Turn", ctrl_cost_weight=0.3, offset_cost_weight=0.7, heading_tolerance=0.8)
+    # Half a turn away, so that the angle still to turn crosses the cut at ±π.
+    env.reset(seed=4, options={"q": [0.3, -0.2, 2.9, 0.1, 0.0], "target": {"turn_size": np.pi, "turn_side": 0.2}})
+    assert env.targets == {"target_heading": 2.9 + np.pi, "start_x": 0.3, "start_y": -0.2}
+    signs = set()
+    for action in actions(env, 120):
+        observation, reward, terminated, _, info = env.step(action)
+        e, offset = _apart(env, 2.9 + np.pi), complex(0.3, -0.2) - complex(*env.q[:2])
+        seen = offset * np.exp(-1j * env.q[2])
+        # float32 rounds to 6e-8 of numbers up to one, and there are numbers up to four behind a cosine.
+        assert observation[-4:] == pytest.approx([seen.real, seen.imag, np.cos(e), np.sin(e)], rel=1e-7, abs=2e-7)
+        assert info["heading_error"] == pytest.approx(e, abs=1e-14)
+        assert info["offset"] == pytest.approx(abs(offset), rel=1e-12, abs=1e-15)
+        assert info["reward_heading"] == pytest.approx(-abs(e) / np.pi, abs=1e-14)
+        assert info["reward_offset"] == pytest.approx(-0.7 * abs(offset), rel=1e-12, abs=1e-15)
+        # an exponent of fifteen
+        assert info["reward_arrival"] == pytest.approx(0.5 * np.exp(-((e / 0.8) ** 2)), rel=1e-11)
+        assert info["reward_ctrl"] == pytest.approx(-0.3 * np.mean(action.astype(float) ** 2), rel=1e-14)
+        assert reward == sum(info[key] for key in info if key.startswith("reward_"))
+        assert terminated is False
+        signs.add(np.sign(e))
+    assert signs == {-1, 1}  # it crossed the cut, or this test shows less than it says
+
+
+def test_reward_and_observation_of_the_park_task(make_task, actions):
+    env = make_task("snakeboard", "Park", near_reward_weight=1.5, progress_reward_weight=0.6, offset_tolerance=0.3)
+    env.reset(seed=4, options={"q": [0.3, -0.2, 0.9, 0.1, 0.4], "target": {"park_size": 0.25, "park_side": -0.2}})
+    place = complex(0.3, -0.2) - 0.25 * np.exp(1j * (0.9 + np.pi / 2))
+    # Places of order one.
+    assert complex(env.targets["place_x"], env.targets["place_y"]) == pytest.approx(place, abs=1e-15)
+    assert env.targets["target_heading"] == 0.9
+    before = 0.25
+    for action in actions(env, 60):
+        observation, reward, terminated, _, info = env.step(action)
+        e, offset = _apart(env, 0.9), place - complex(*env.q[:2])
+        seen, d = offset * np.exp(-1j * env.q[2]), abs(offset)
+        assert observation[-4:] == pytest.approx([seen.real, seen.imag, np.cos(e), np.sin(e)], rel=1e-7, abs=2e-7)
+        assert (info["heading_error"], info["offset"]) == pytest.approx((e, d), rel=1e-12, abs=1e-14)
+        # Differences of distances of order one over 0.05 s.
+        assert info["reward_progress"] == pytest.approx(0.6 * (before - d) / 0.05, rel=1e-12, abs=1e-12)
+        near = 1.5 * np.exp(-((d / 0.2) ** 2)) * (0.25 + 0.75 * ((1 + np.cos(e)) / 2) ** 2)
+        assert info["reward_near"] == pytest.approx(near, rel=1e-11)
+        assert info["reward_arrival"] == pytest.approx(np.exp(-((d / 0.3) ** 2) - (e / 0.15) ** 2), rel=1e-10)
+        assert info["reward_ctrl"] == pytest.approx(-0.02 * np.mean(action.astype(float) ** 2), rel=1e-14)
+        assert reward == sum(info[key] for key in info if key.startswith("reward_"))
+        assert terminated is False
+        before = d
+
+
+@pytest.mark.parametrize(
+    ("task", "target", "tolerance"),
+    [("Turn", {"turn_side": 1.0, "start_x": 0.0}, 0.15), ("Park", {"place_x": 0.0, "place_y": 0.0}, 0.1)],
+)
+def test_what_counts_as_success(make_task, task, target, tolerance):
+    """At rest a hair inside of both tolerances, and a hair outside of either."""
+    env, nothing = make_task("snakeboard", task), np.zeros(2, np.float32)
+    heading, hair = 0.3, 1e-9
+    q = np.array([0, 0, heading, 0, 0.0])
+    for turn, offset, success in ((-hair, -hair, 1), (hair, -hair, 0), (-hair, hair, 0), (hair, hair, 0)):
+        place = "start_y" if task == "Turn" else "place_x"
+        aim = {"target_heading": heading - 0.15 - turn, place: tolerance + offset}
+        env.reset(options={"q": q, "target": {**target, **aim}})
+        assert env.step(nothing)[4]["is_success"] == success
+
+
+@pytest.mark.parametrize("task", ["Goal", "Turn", "Park"])
+def test_targets_are_seen_from_the_start(make_task, task):
+    """A displaced and turned start moves the targets with it; what is seen of them stays the same."""
+    env = make_task("snakeboard", task)
+    first, _ = env.reset(seed=6, options={"q": np.zeros(5)})
+    second, _ = env.reset(seed=6, options={"q": [3.0, -2.0, 1.1, 0, 0]})
+    # float32
+    assert second == pytest.approx(first, rel=1e-6, abs=3e-7)
+
+
+def test_targets_are_seen_from_a_start_that_is_drawn(make_task):
+    """A disk has no joints: its heading is random."""
+    env = make_task("vertical_rolling_disk", "Park", reset_noise_scale=1.0)
+    for seed in range(5):
+        env.reset(seed=seed)
+        x, y, heading = _pose(env)
+        assert env.targets["target_heading"] == heading != 0
+        offset = complex(env.targets["place_x"] - x, env.targets["place_y"] - y) * np.exp(-1j * heading)
+        assert offset.real == pytest.approx(0, abs=1e-15)  # straight to the side
+        assert 0.3 <= abs(offset) <= 1
+
+
+def test_turn_and_park_are_drawn_to_both_sides(make_task):
+    turn, park = make_task("snakeboard", "Turn"), make_task("snakeboard", "Park")
+    angles, places = [], []
+    for seed in range(2000):
+        angles.append(turn.reset(seed=seed)[1]["target_heading"])
+        places.append(park.reset(seed=seed)[1]["place_y"])
+    for values, low, high in ((angles, np.pi / 4, np.pi), (places, 0.3, 1.0)):
+        assert _uniform(np.abs(values), low, high)
+        # 2000 throws of a coin: a standard deviation of 0.011.
+        assert abs(np.mean(np.sign(values) > 0) - 0.5) < 0.05
 
 
 # -- targets ------------------------------------------------------------------------------------
@@ -398,8 +506,8 @@ IMPOSSIBLE = {
     "bounds NaN": ({"targets": {"aim": [math.nan, 1]}}, ["'aim'", "finite", "nan"]),
     "one bound": ({"targets": {"aim": [1]}}, ["'aim'", "two"]),
     "a number": ({"targets": {"aim": 1.0}}, ["'aim'", "(low, high)"]),
-    "target of later targets": ({"targets": {"aim": "2*half", "half": [0, 1]}}, ["targets, aim", "'half'", "none"]),
-    "target of a state": ({"targets": {"half": [0, 1], "aim": "half*x"}}, ["targets, aim", "'x'", "known: half"]),
+    "target of later targets": ({"targets": {"aim": "2*half", "half": [0, 1]}}, ["targets, aim", "'half'", "known: x, y, heading"]),
+    "target of a state": ({"targets": {"half": [0, 1], "aim": "half*phi"}}, ["targets, aim", "'phi'", "known: half"]),
     "target with a taken name": ({"targets": {"speed": [0, 1]}}, ["'speed'", "meaning of its own"]),
     "target named as a rate": ({"targets": {"aim_dot": [0, 1]}}, ["'aim_dot'", "meaning of its own"]),
     "definition with a taken name": ({"definitions": {"v1": "x"}}, ["'v1'", "meaning of its own"]),
