@@ -237,7 +237,7 @@ def write(path: Path, rows: Iterable[Row]) -> None:
     """One line for each row of the table."""
     columns = [column.name for column in fields(Row) if column.name != "failures"]
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([getattr(row, column) for column in columns] for row in rows)
 

@@ -283,7 +283,7 @@ def write(path: Path, results: Results, chosen: Mapping[Ours, Contender]) -> Non
         lines.append(line)
     columns = list(dict.fromkeys(name for line in lines for name in line))
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
 

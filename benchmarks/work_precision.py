@@ -306,7 +306,8 @@ def run_sheet(found: dict[str, list[RunErrors]]) -> Sheet:
 def write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """A CSV file, one line each, SI units."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        writer = csv.DictWriter(file, names, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
