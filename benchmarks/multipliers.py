@@ -21,6 +21,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike, NDArray
 
+from benchmarks.textbook import textbook
 from mechanics.mechanism import Mechanism
 
 __all__ = ["DIGITS", "Motion", "Multipliers"]
@@ -456,31 +457,15 @@ class _Ingredients:
 
 @cache
 def _ingredients(data: str, digits: int | None) -> _Ingredients:
-    m = Mechanism.from_dict(json.loads(data))
-
-    def read(rows: Any) -> list[list[sp.Expr]]:
-        return [[m.symbolic(text) for text in row] for row in rows]
-
-    q = [m.symbols[c] for c in m.coordinates]
-    rates = [sp.Symbol(name) for name in m.rates]
-    inertia, forms = read(m.inertia), read(m.one_forms)
-    ((potential,),) = read([[m.potential]])
-    kinetic = sum(inertia[a][b] * rates[a] * rates[b] for a in range(m.n) for b in range(m.n)) / 2
-    # d/dt (M q̇) - ∂/∂q (T - V), less what holds q̈.
-    momentum = [sum(entry * rate for entry, rate in zip(row, rates, strict=True)) for row in inertia]
-
-    def along(expression: sp.Expr) -> sp.Expr:
-        return sum((sp.diff(expression, c) * rate for c, rate in zip(q, rates, strict=True)), sp.S.Zero)
-
-    bias = [along(p) - sp.diff(kinetic - potential, c) for p, c in zip(momentum, q, strict=True)]
-    curvature = [sum(along(entry) * rate for entry, rate in zip(row, rates, strict=True)) for row in forms]
+    mechanism = Mechanism.from_dict(json.loads(data))
+    t = textbook(mechanism)
     modules: list[Any] = ["numpy"]
     if digits is not None:
         functions = ("sin", "cos", "tan", "sqrt", "exp", "log", "atan", "asin", "acos", "sinh", "cosh", "tanh")
         modules = [{f: np.frompyfunc(getattr(mpmath, f), 1, 1) for f in functions}, "numpy"]
-    places = [*q, *(m.symbols[p] for p in m.parameters)]
-    resting = [inertia, forms, read(m.forces.values()), potential]
+    places = [*t.q, *t.parameters]
+    resting = [t.inertia, t.forms, t.forces, mechanism.symbolic(mechanism.potential)]
     return _Ingredients(
         sp.lambdify(places, resting, modules, cse=True),
-        sp.lambdify([*places, *rates], [bias, curvature], modules, cse=True),
+        sp.lambdify([*places, *t.qdot], [t.bias, t.turning], modules, cse=True),
     )

@@ -55,10 +55,8 @@ def textbook(mechanism: Mechanism) -> Textbook:
     def read(rows: Any) -> list[list[sp.Expr]]:
         return [[mechanism.symbolic(text) for text in row] for row in rows]
 
-    inertia, forms = (
-        sp.Matrix(read(mechanism.inertia)),
-        sp.Matrix(read(REGULAR.get(mechanism.name, mechanism.one_forms))),
-    )
+    rows = read(REGULAR.get(mechanism.name, mechanism.one_forms))
+    inertia, forms = sp.Matrix(read(mechanism.inertia)), sp.Matrix(len(rows), mechanism.n, sum(rows, []))
     velocity = sp.Matrix(qdot)
     lagrangian = (velocity.T * inertia * velocity)[0] / 2 - mechanism.symbolic(mechanism.potential)
     bias = (inertia * velocity).jacobian(q) * velocity - sp.Matrix([sp.diff(lagrangian, c) for c in q])

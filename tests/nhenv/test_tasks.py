@@ -506,7 +506,10 @@ IMPOSSIBLE = {
     "bounds NaN": ({"targets": {"aim": [math.nan, 1]}}, ["'aim'", "finite", "nan"]),
     "one bound": ({"targets": {"aim": [1]}}, ["'aim'", "two"]),
     "a number": ({"targets": {"aim": 1.0}}, ["'aim'", "(low, high)"]),
-    "target of later targets": ({"targets": {"aim": "2*half", "half": [0, 1]}}, ["targets, aim", "'half'", "known: x, y, heading"]),
+    "target of later targets": (
+        {"targets": {"aim": "2*half", "half": [0, 1]}},
+        ["targets, aim", "'half'", "known: x, y, heading"],
+    ),
     "target of a state": ({"targets": {"half": [0, 1], "aim": "half*phi"}}, ["targets, aim", "'phi'", "known: half"]),
     "target with a taken name": ({"targets": {"speed": [0, 1]}}, ["'speed'", "meaning of its own"]),
     "target named as a rate": ({"targets": {"aim_dot": [0, 1]}}, ["'aim_dot'", "meaning of its own"]),
