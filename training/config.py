@@ -83,7 +83,12 @@ class PPOConfig:
         gae_lambda: λ of the generalized advantage estimate.
         clip_range: clip of the probability ratio.
         target_kl: an update stops early above 1.5 times this divergence.
+        entropy: weight of the policy's entropy.
         log_std: initial logarithm of the policy's standard deviation, in actions.
+        reward_scale: what rewards are multiplied by. Value function and policy share a limit on the gradient, and
+            returns of hundreds leave nothing of it to the policy.
+        start_energy: J; episodes begin in motion, with up to this much, ever fewer of them; 0 for none.
+        start_share: part of the training after which all begin at rest.
         hidden: units of each tanh layer; policy and value function share none.
         curve_every: updates between two points of the learning curve.
         curve_episodes: episodes of the deterministic policy behind each point.
@@ -101,7 +106,11 @@ class PPOConfig:
     gae_lambda: float = 0.95
     clip_range: float = 0.2
     target_kl: float = 0.03
+    entropy: float = 0.0
     log_std: float = 0.0
+    reward_scale: float = 1.0
+    start_energy: float = 0.0
+    start_share: float = 0.8
     hidden: tuple[int, ...] = (64, 64)
     curve_every: int = 10
     curve_episodes: int = 8

@@ -24,12 +24,14 @@ from rich.console import Console
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
 
 from nhenv.sb3 import make_sb3_vec_env
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed, within
 from training.evaluate import PolicyController, make_envs, measure, rollout
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
+from training.wrappers import MovingStarts, ScaledReward
 
 __all__ = ["ppo_path", "ppo_settings", "train_piece"]
 
@@ -118,11 +120,20 @@ class Run(BaseCallback):
         return model
 
 
+def make_envs_to_learn_in(env_id: str, config: PPOConfig, seed: int) -> VecEnv:
+    """Environments with the starts and the scale of rewards that the settings ask for."""
+    envs: VecEnv = make_sb3_vec_env(check_env_id(env_id), config.n_envs, **config.env_kwargs)
+    if config.start_energy:
+        steps = round(config.start_share * config.timesteps)
+        envs = MovingStarts(envs, config.start_energy, steps, training_seed(seed))
+    return ScaledReward(envs, config.reward_scale)
+
+
 def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
     """An untrained model."""
     return PPO(
         "MlpPolicy",
-        make_sb3_vec_env(check_env_id(env_id), config.n_envs, **config.env_kwargs),
+        make_envs_to_learn_in(env_id, config, seed),
         learning_rate=Linear(*config.learning_rate),
         n_steps=config.n_steps,
         batch_size=config.batch_size,
@@ -131,6 +142,7 @@ def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
         gae_lambda=config.gae_lambda,
         clip_range=config.clip_range,
         target_kl=config.target_kl,
+        ent_coef=config.entropy,
         policy_kwargs={
             "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
             "activation_fn": torch.nn.Tanh,

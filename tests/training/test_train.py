@@ -13,8 +13,9 @@ from training.train import Linear, Run, make_model, ppo_path, train_piece
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = PPOConfig(
-    timesteps=1280, n_envs=4, n_steps=32, batch_size=64, n_epochs=2, curve_every=2, curve_episodes=1, checkpoint_every=3
-)
+    timesteps=1280, n_envs=4, n_steps=32, batch_size=64, n_epochs=2, curve_every=2, curve_episodes=1,
+    checkpoint_every=3, reward_scale=0.1, start_energy=20.0,
+)  # fmt: skip
 
 
 def parameters(out, seed=0):
@@ -83,13 +84,16 @@ def test_settings_reach_the_algorithm():
     # None of these is a default of Stable-Baselines3.
     config = PPOConfig(
         n_envs=2, n_steps=8, batch_size=4, n_epochs=3, learning_rate=(4e-3, 2e-3), gamma=0.9, gae_lambda=0.8,
-        clip_range=0.3, target_kl=0.07, log_std=-0.5, hidden=(16, 8),
+        clip_range=0.3, target_kl=0.07, entropy=0.01, log_std=-0.5, hidden=(16, 8),
+        reward_scale=0.25, start_energy=7.0, start_share=0.5, timesteps=6000,
     )  # fmt: skip
     model = make_model(SNAKEBOARD, config, 3)
     assert model.seed == 3000
     assert (model.n_envs, model.n_steps, model.batch_size, model.n_epochs) == (2, 8, 4, 3)
     assert (model.gamma, model.gae_lambda, model.clip_range(1.0), model.target_kl) == (0.9, 0.8, 0.3, 0.07)
-    assert model.ent_coef == 0
+    assert model.ent_coef == 0.01
+    assert model.env.factor == 0.25
+    assert (model.env.venv.energy, model.env.venv.steps) == (7.0, 3000)
     assert [model.lr_schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([4e-3, 3e-3, 2e-3])
     assert model.policy.log_std.tolist() == [-0.5, -0.5]
     for net in (model.policy.mlp_extractor.policy_net, model.policy.mlp_extractor.value_net):

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from scipy.stats import kstest
+
+from mechanics.model import Model
+from nhenv.sb3 import SB3VecEnv, make_sb3_vec_env
+from training.wrappers import MovingStarts, ScaledReward
+
+SNAKEBOARD, RACER = "nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0"
+ENERGY, ROWS = 40.0, 400
+
+
+def _made(env_id, rows=ROWS, steps=10**9, **arguments):
+    return MovingStarts(
+        make_sb3_vec_env(env_id, rows, staggered=False, whole_state=True, **arguments), ENERGY, steps, seed=3
+    )
+
+
+def _inner(envs):
+    return envs.venv.vector_env.unwrapped
+
+
+@pytest.mark.parametrize("env_id", [SNAKEBOARD, RACER])
+def test_first_episodes_begin_in_motion(env_id):
+    envs = _made(env_id, drag=True)
+    observations, inner = envs.reset(), _inner(envs)
+    # The seed is fixed, so a p-value says how lucky it is, once and for all.
+    assert kstest(inner.energy, "uniform", (0, ENERGY)).pvalue > 0.01
+    assert kstest(inner.q[:, 2], "uniform", (-np.pi, 2 * np.pi)).pvalue > 0.01
+    assert (inner.q[:, :2] == 0).all()
+    for joint, stop in inner.joint_limits.items():
+        place = inner.mechanism.coordinates.index(joint)
+        assert kstest(inner.q[:, place], "uniform", (-stop, 2 * stop)).pvalue > 0.01
+        assert np.abs(inner.qdot[:, place]).max() < 1e-12  # a solve of a few terms of order one
+    residual = Model(inner.mechanism, inner.params).constraint_residual(inner.q, inner.qdot)
+    assert np.abs(residual).max() < 1e-12
+    # What is seen is this state and not the one at rest.
+    speed = inner.observation_labels.index("speed")
+    ahead = np.cos(inner.q[:, 2]) * inner.qdot[:, 0] + np.sin(inner.q[:, 2]) * inner.qdot[:, 1]
+    assert observations[:, speed] == pytest.approx(ahead, rel=1e-6, abs=1e-6)  # float32
+    assert np.abs(ahead).max() > 1
+
+
+def test_ever_fewer_begin_in_motion_and_at_last_none():
+    envs = _made(SNAKEBOARD, steps=ROWS * 900)
+    envs.reset()
+    shares = []
+    for step in range(1, 1201):
+        _, _, dones, _ = envs.step(np.zeros((ROWS, 2), np.float32))
+        if dones.any():
+            assert dones.all()
+            assert step % 300 == 0
+            shares.append((_inner(envs).energy > 0).mean())
+    # Thrown like coins: a deviation of 0.025.
+    assert shares[:2] == pytest.approx([2 / 3, 1 / 3], abs=0.08)
+    assert shares[2:] == [0, 0]
+
+
+def test_a_row_at_rest_is_left_alone():
+    """It goes on as if there were no curriculum: the same start, and the same one after that."""
+    envs, plain = _made(SNAKEBOARD, 20, steps=20), make_sb3_vec_env(SNAKEBOARD, 20, staggered=False)
+    envs.taken = 10  # half of them
+    for each in (envs, plain):
+        each.seed(5)
+    moved = (envs.reset() != plain.reset()).any(axis=1)
+    assert 0 < moved.sum() < 20
+    inner, bare = _inner(envs), plain.vector_env.unwrapped
+    assert np.array_equal(inner.q[~moved], bare.q[~moved])
+    assert (inner.energy[~moved] == 0).all()
+
+
+def test_rewards_are_scaled_and_nothing_else():
+    envs, plain = (make_sb3_vec_env(SNAKEBOARD, 3, seed=1) for _ in range(2))
+    scaled = ScaledReward(envs, 0.25)
+    assert np.array_equal(scaled.reset(), plain.reset())
+    for _ in range(30):
+        first, second = (each.step(np.full((3, 2), 0.7, np.float32)) for each in (scaled, plain))
+        assert np.array_equal(first[0], second[0])
+        assert np.array_equal(first[1], 0.25 * second[1])  # a power of two
+        assert np.array_equal(first[2], second[2])
+    assert (first[1] != 0).all()
+
+
+def test_other_environments_are_refused():
+    import gymnasium as gym
+
+    envs = SyncVectorEnv([lambda: gym.make(SNAKEBOARD)], autoreset_mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(TypeError, match="only native environments can begin in motion"):
+        MovingStarts(SB3VecEnv(envs), 1.0, 1, 0)

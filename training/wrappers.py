@@ -1,0 +1,105 @@
+"""What learning changes about its environments; judging knows nothing of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from mechanics.model import Model
+from nhenv.sb3 import SB3VecEnv
+from nhenv.vector_env import LocomotionVectorEnv
+
+__all__ = ["MovingStarts", "ScaledReward"]
+
+Array = NDArray[np.float64]
+
+
+class ScaledReward(VecEnvWrapper):
+    """Multiplies rewards.
+
+    `VecNormalize` finds a factor by itself, but cannot be pickled with its environments, as checkpoints need.
+
+    Args:
+        venv: any environments.
+        factor: what rewards are multiplied by.
+    """
+
+    def __init__(self, venv: VecEnv, factor: float) -> None:
+        super().__init__(venv)
+        self.factor = np.float32(factor)
+
+    def reset(self) -> VecEnvObs:
+        """Reset all rows."""
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all rows."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, self.factor * rewards, dones, infos
+
+
+class MovingStarts(VecEnvWrapper):
+    """Begins a share of the episodes in motion; the share falls from 1 to 0.
+
+    At rest nothing tells a policy what momentum is worth. One that has begun in motion often enough knows, and then
+    finds out by itself how to come by it.
+
+    Such an episode begins at the origin, with any heading, joints anywhere within their stops and at rest, and other
+    pseudo-velocities in any direction, with a kinetic energy that is uniform up to `energy`.
+
+    Args:
+        venv: native environments of `nhenv.sb3.make_sb3_vec_env`.
+        energy: largest kinetic energy at the start, J.
+        steps: environment steps, over all rows, after which every episode begins at rest.
+        seed: seed of these starts.
+    """
+
+    def __init__(self, venv: SB3VecEnv, energy: float, steps: int, seed: int) -> None:
+        super().__init__(venv)
+        envs = venv.vector_env.unwrapped
+        if not isinstance(envs, LocomotionVectorEnv):
+            raise TypeError(f"only native environments can begin in motion, got {envs}")
+        self.energy, self.steps, self.taken = energy, steps, 0
+        self._rng = np.random.default_rng([seed, 1])
+        self._envs = envs
+
+    def reset(self) -> NDArray[np.float32]:
+        """Reset all rows."""
+        return self._move(np.asarray(self.venv.reset()), np.ones(self.num_envs, bool))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all rows; the next episodes of those that are done may begin in motion."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        self.taken += self.num_envs
+        if dones.any():
+            observations = self._move(np.asarray(observations), dones)
+        return observations, rewards, dones, infos
+
+    def _move(self, observations: NDArray[np.float32], begun: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Observations in which some of the rows that have `begun` are in motion."""
+        moving = begun & (self._rng.random(self.num_envs) < 1 - self.taken / self.steps)
+        if not moving.any():
+            return observations
+        # Every row takes part in the drawing, so that what one gets does not depend on the others.
+        q, qdot = self._states()
+        elapsed = self._envs.elapsed_steps  # first episodes end out of phase
+        seen, _ = self._envs.reset(options={"reset_mask": moving, "q": q, "qdot": qdot})
+        self._envs.elapsed_steps = elapsed
+        return np.where(moving[:, None], seen, observations)
+
+    def _states(self) -> tuple[Array, Array]:
+        """Coordinates and velocities (N, n) of rows in motion."""
+        mechanism = self._envs.mechanism
+        model = Model(mechanism, self._envs.params)
+        coordinates, rows = mechanism.coordinates, self.num_envs
+        q = np.zeros((rows, mechanism.n))
+        q[:, coordinates.index(mechanism.fibre[2])] = self._rng.uniform(-np.pi, np.pi, rows)
+        joints = [coordinates.index(joint) for joint in self._envs.joint_limits]
+        for joint, stop in zip(joints, self._envs.joint_limits.values(), strict=True):
+            q[:, joint] = self._rng.uniform(-stop, stop, rows)
+        turns = model.velocity(q[:1].repeat(mechanism.rank, 0), np.eye(mechanism.rank))[:, joints].any(axis=1)
+        v = np.where(turns, 0.0, self._rng.normal(size=(rows, mechanism.rank)))
+        v *= np.sqrt(self._rng.uniform(0, self.energy, rows) / model.energy(q, v))[:, None]
+        return q, model.velocity(q, v)
