@@ -8,6 +8,7 @@ mechanics.simulate(mechanism, t, q0)            # motion
 
 from typing import TYPE_CHECKING, Any
 
+from mechanics.bodies import Body
 from mechanics.catalog import get, names
 from mechanics.mechanism import Mechanism, MechanismError
 from mechanics.model import Model, acceleration
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from mechanics.geometry.reduction import ReducedEquations, reduce
 
 __all__ = [
+    "Body",
     "Mechanism",
     "MechanismError",
     "Model",

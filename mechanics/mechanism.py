@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mechanics import spec as specs
+from mechanics.bodies import COLOURS, SHAPES, Body
 from mechanics.expressions import (
     MAX_SIZE,
     QUANTITY,
@@ -50,7 +51,15 @@ POSITIVE_TOLERANCE = 1e-12
 SAMPLES = 6
 
 # With these, checking a mechanism takes less than a second whatever it is (tests/mechanics/test_spec.py).
-MOST = {"coordinate": 64, "parameter": 256, "control": 64, "definition": 256, "drag coefficient": 64, "frame": 16}
+MOST = {
+    "coordinate": 64,
+    "parameter": 256,
+    "control": 64,
+    "definition": 256,
+    "drag coefficient": 64,
+    "frame": 16,
+    "body": 256,
+}
 MAX_CHARACTERS = 100_000  # of all expressions together; a snake of twenty links has 23,000
 
 
@@ -84,6 +93,7 @@ class Mechanism:
         rayleigh: Rayleigh's function R in W, quadratic in the rates NAME_dot of the coordinates, with
             coefficients named in `drag`; the drag is the one-form -dR/dq̇. It acts where it is asked for.
         drag: coefficient of R -> default value (N s/m for wheels, N m s for joints).
+        bodies: name -> what is drawn of the mechanism, seen from above. No equation follows from them.
     """
 
     name: str
@@ -103,9 +113,11 @@ class Mechanism:
     forward: str = "1"
     rayleigh: str = "0"
     drag: Mapping[str, float] = field(default_factory=dict)
+    bodies: Mapping[str, Body] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._check_names()
+        self._check_bodies()
         self._check_amount()
         self._check_sizes()
         self._check_expressions()
@@ -134,9 +146,16 @@ class Mechanism:
         except MechanismError as error:
             raise MechanismError(f"{os.fspath(path)}: {error}") from None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the plain data of this mechanism; `from_dict` makes an equal one of it."""
-        return dataclasses.asdict(self)
+    def to_dict(self, *, drawing: bool = True) -> dict[str, Any]:
+        """Return the plain data of this mechanism; `from_dict` makes an equal one of it.
+
+        Args:
+            drawing: whether with the bodies, from which nothing follows but pictures.
+        """
+        data = dataclasses.asdict(self)
+        if not drawing:
+            del data["bodies"]
+        return data
 
     # -- sizes ---------------------------------------------------------------------------------
 
@@ -301,10 +320,19 @@ class Mechanism:
                 seen[name] = kind
 
     def _check_amount(self) -> None:
-        amounts = (self.coordinates, self.parameters, self.forces, self.definitions, self.drag, self.frames)
+        amounts = (
+            self.coordinates,
+            self.parameters,
+            self.forces,
+            self.definitions,
+            self.drag,
+            self.frames,
+            self.bodies,
+        )
         for (kind, most), things in zip(MOST.items(), amounts, strict=True):
             if len(things) > most:
-                raise MechanismError(f"{self.name}: {len(things)} {kind}s; at most {most} are handled")
+                several = "bodies" if kind == "body" else f"{kind}s"
+                raise MechanismError(f"{self.name}: {len(things)} {several}; at most {most} are handled")
         texts = [*self.definitions.values(), *self.observation.values(), *(text for _, text in self._entries())]
         if (total := sum(len(str(text)) for text in texts)) > MAX_CHARACTERS:
             raise MechanismError(
@@ -342,6 +370,26 @@ class Mechanism:
             raise MechanismError(f"{self.name}: fibre names (x, y, heading), got {self.fibre}")
         self._check_coefficients(self.drag)
 
+    def _check_bodies(self) -> None:
+        before: list[str] = []
+        for name, body in self.bodies.items():
+            where = f"{self.name}: body {name!r}"
+            if not isinstance(body, Body) or not name:
+                raise MechanismError(f"{where} must be a mechanics.Body with a name, got {body!r}")
+            if body.shape not in SHAPES:
+                raise MechanismError(f"{where}: {unknown_name('shape', body.shape, SHAPES)}")
+            if len(body.pose) != 3:
+                raise MechanismError(f"{where}: pose must be (x, y, angle), got {body.pose}")
+            if len(body.size) != len(SHAPES[body.shape]):
+                raise MechanismError(
+                    f"{where}: the size of a {body.shape} must be ({', '.join(SHAPES[body.shape])}), got {body.size}"
+                )
+            if body.colour not in COLOURS:
+                raise MechanismError(f"{where}: {unknown_name('colour', body.colour, COLOURS)}")
+            if body.on and body.on not in before:
+                raise MechanismError(f"{where}, on: {unknown_name('body before it', body.on, before)}")
+            before.append(name)
+
     def _check_frame_size(self, rows: Matrix, name: str) -> None:
         if len(rows) != self.rank or any(len(row) != self.n for row in rows):
             raise MechanismError(
@@ -361,6 +409,7 @@ class Mechanism:
         matrices |= {f"force {name!r}": (row,) for name, row in self.forces.items()}
         matrices |= {f"frame {name!r}": rows for name, rows in self.frames.items()}
         matrices["potential"] = ((self.potential,),)
+        matrices |= {f"body {name!r}": (body.pose, body.size) for name, body in self.bodies.items()}
         return ((kind, text) for kind, rows in matrices.items() for row in rows for text in row)
 
     @cached_property
@@ -426,6 +475,15 @@ class Mechanism:
         for name, rows in self.frames.items():
             self._check_frame(rows, name)
         self._check_drag()
+        for name, body in self.bodies.items():
+            self._finite(f"the pose of body {name!r}", (body.pose,), points)
+            size = self._finite(f"the size of body {name!r}", (body.size,), points)[:, 0]
+            if (size < 0).any():
+                sample, entry = np.argwhere(size < 0)[0]
+                raise MechanismError(
+                    f"{self.name}: body {name!r}: its {SHAPES[body.shape][entry]} must be at least 0, but "
+                    f"{body.size[entry]!r} is {size[sample, entry]:.3g} at {_at(points, sample)}"
+                )
 
     def _finite(self, what: str, entries: Matrix, points: Mapping[str, Any]) -> NDArray[np.float64]:
         """Values [samples, rows, columns] of a matrix, all finite."""

@@ -49,7 +49,7 @@ class Model:
         rows = mechanism.frame_rows(frame)
         self.drag = mechanism.drag_coefficients(drag)
         acts = self.drag is not None
-        specification = {"mechanism": mechanism.to_dict(), "frame": rows, "drag": acts}
+        specification = {"mechanism": mechanism.to_dict(drawing=False), "frame": rows, "drag": acts}
         self._functions = kernels.load(f"{mechanism.name}_model", specification, lambda: _source(mechanism, rows, acts))
         self._constants = np.array(self._functions.constants([*self.params.values(), *(self.drag or {}).values()]))
 

@@ -19,6 +19,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
+from mechanics.bodies import Body
 from mechanics.expressions import ExpressionError, names_in, unknown_name
 
 __all__ = ["Matrix", "MechanismError", "arguments", "matrix", "number", "read"]
@@ -144,6 +145,25 @@ def _table(entry: Callable[[Any, str], Any]) -> Callable[[Any, str], dict[str, A
     return read_table
 
 
+def _body(data: Any, what: str) -> Body:
+    if not isinstance(data, Mapping):
+        raise MechanismError(f"{what} must map {', '.join(_BODY)} to values, not {_show(data)}")
+    for key in data:
+        if key not in _BODY:
+            raise MechanismError(f"{what}: {unknown_name('key', str(key), _BODY)}")
+    for key in ("shape", "pose", "size"):
+        if key not in data:
+            raise MechanismError(f"{what} lacks {key!r}; it has {', '.join(map(str, data)) or 'nothing'}")
+    return Body(**{key: _BODY[key](value, f"{what}, {key}") for key, value in data.items()})
+
+
+_BODY: dict[str, Callable[[Any, str], Any]] = {
+    "shape": _string,
+    "pose": _row,
+    "size": _row,
+    "on": _string,
+    "colour": _string,
+}
 _READERS: dict[str, Callable[[Any, str], Any]] = {
     "name": _string,
     "coordinates": _names,
@@ -163,6 +183,7 @@ _READERS: dict[str, Callable[[Any, str], Any]] = {
     "forward": _expression,
     "rayleigh": _expression,
     "drag": _table(number),
+    "bodies": _table(_body),
 }
 
 

@@ -17,9 +17,10 @@ from mechanics.expressions import evaluate, unknown_name
 from mechanics.model import Model
 from nhenv import checks, tasks
 from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
+from nhenv.render import Screen, View, marker_of
 from nhenv.scene import Scene
 
-__all__ = ["Configuration", "passes_arguments_on"]
+__all__ = ["MODES", "Configuration", "passes_arguments_on"]
 
 Array = NDArray[np.float64]
 Init = TypeVar("Init", bound=Callable[..., None])
@@ -27,6 +28,8 @@ Init = TypeVar("Init", bound=Callable[..., None])
 TOLERANCE = 1e-10
 SMALLEST_TOLERANCE = 1e-13
 SHORTEST_PERIOD = 1e-9
+MODES = ("human", "rgb_array")
+SMALLEST_PICTURE, LARGEST_PICTURE = 32, 2048  # pixels; shapes are drawn four times as large
 
 
 class Configuration:
@@ -43,6 +46,8 @@ class Configuration:
         reset_noise_scale: half-width of the initial angles.
         scene: what is compiled.
         weights: name -> value.
+        render_mode: None, "human" or "rgb_array".
+        render_size: width and height of a picture, in pixels.
     """
 
     def __init__(
@@ -64,10 +69,11 @@ class Configuration:
         backend: str = "numba",
         whole_state: bool = False,
         render_mode: str | None = None,
+        render_size: tuple[int, int] = (640, 400),
         **weights: float,
     ) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}: these environments do not draw")
+        if render_mode is not None and render_mode not in MODES:
+            raise ValueError(f"render_mode must be None or one of {', '.join(MODES)}, got {render_mode!r}")
         for name, value in {"keep_energy": keep_energy, "whole_state": whole_state}.items():
             if not isinstance(value, bool | np.bool_):
                 raise ValueError(f"{name} must be True or False, got {value!r}")
@@ -84,6 +90,7 @@ class Configuration:
         self.joint_limits = self._joint_limits(joint_limits)
         self.reset_noise_scale = self._noise(reset_noise_scale)
         self.weights = self._weights(weights)
+        self.render_mode, self.render_size = render_mode, _size(render_size)
         self.scene = Scene(
             self.mechanism,
             self.task,
@@ -108,6 +115,31 @@ class Configuration:
                 "neither way; change a parameter"
             )
         return {**self.weights, **params, "dt": self.dt, "forward": forward, **(drag or {})}
+
+    def screen(self) -> Screen | None:
+        """Where the environments are drawn; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return Screen(self.render_mode, self.render_size, self.title, self.fps)
+
+    def view(self, params: Mapping[str, float]) -> View:
+        """What is seen of one environment with these parameters."""
+        return View(self.mechanism, params, self.dt, self.title)
+
+    def marker(self, targets: Mapping[str, float]) -> dict[str, float]:
+        """Where to draw these targets of an episode."""
+        return marker_of(self.task, {**self.weights, **targets})
+
+    @property
+    def title(self) -> str:
+        """Mechanism and task in words."""
+        return f"{self.mechanism.name.replace('_', ' ')}, {self.task.name}"
+
+    @property
+    def fps(self) -> float:
+        """Control periods a second."""
+        rate = 1 / self.dt
+        return round(rate) if math.isclose(rate, round(rate)) else rate
 
     @cached_property
     def model(self) -> Model:
@@ -211,6 +243,19 @@ def passes_arguments_on(init: Init) -> Init:
     everything = [*named, *(other for other in others if other.name not in own.parameters)]
     init.__signature__ = own.replace(parameters=everything)  # type: ignore[attr-defined]
     return init
+
+
+def _size(given: Any) -> tuple[int, int]:
+    try:
+        width, height = given
+    except (TypeError, ValueError):
+        raise ValueError(f"render_size must be (width, height) in pixels, got {given!r}") from None
+    size = checks.whole("render_size: width", width), checks.whole("render_size: height", height)
+    if not SMALLEST_PICTURE <= min(size) <= max(size) <= LARGEST_PICTURE:
+        raise ValueError(
+            f"render_size must be from {SMALLEST_PICTURE} to {LARGEST_PICTURE} pixels each way, got {given!r}"
+        )
+    return size
 
 
 def _tolerance(given: float | None, integrator: str) -> float:

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.expressions import unknown_name
 from mechanics.model import Model
-from nhenv.configuration import Configuration, passes_arguments_on
+from nhenv.configuration import MODES, Configuration, passes_arguments_on
 from nhenv.registration import MechanismLike, TaskLike
+from nhenv.render import Screen
 from nhenv.replay import Replay
-from nhenv.scene import BAD_ACTION, HISTORY_FULL, TERMINATED, Scene
+from nhenv.scene import BAD_ACTION, HISTORY_FULL, RUNNING, TERMINATED, Scene
 
 __all__ = ["LocomotionEnv"]
 
@@ -155,7 +156,10 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             takes some fifty times as long, and a debugger can walk through it.
         whole_state: whether every coordinate is integrated in every step, not only those that something depends on;
             `q` is complete either way, but worked out when asked for without this.
-        render_mode: None; these environments do not draw.
+        render_mode: None; "rgb_array", then `render` returns the present picture, uint8 of shape (height, width, 3); or
+            "human", then a window shows every step at the pace of real time. Both need the extra `render`. The physics
+            is the same to the last bit, but what the scene leaves out is integrated beside it.
+        render_size: width and height of a picture, in pixels.
         **weights: the task's weights. Forward: `forward_reward_weight=1.0`. Velocity: `velocity_cost_weight=2.0`,
             `sideways_cost_weight=0.2`. Goal: `progress_reward_weight=1.0`, `time_cost_weight=0.5`,
             `goal_reward_weight=5.0`, `goal_radius=0.15`. Turn: `heading_cost_weight=1.0`, `offset_cost_weight=0.5`,
@@ -167,11 +171,13 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     * v0: initial version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own declaration)
+    metadata: dict[str, Any] = {"render_modes": [*MODES], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own declaration)
+    _screen: Screen | None = None  # closing an environment that could not be made looks for it
 
     @passes_arguments_on
     def __init__(self, mechanism: MechanismLike, task: TaskLike = "Forward", **arguments: Any) -> None:
         self._configuration = configuration = Configuration(mechanism, task, **arguments)
+        self.render_mode, self._screen = configuration.render_mode, configuration.screen()
         self.mechanism, self.task = configuration.mechanism, configuration.task
         self.params, self.drag, self.dt = configuration.params, configuration.drag, configuration.dt
         self.torque_limits, self.joint_limits = configuration.torque_limits, configuration.joint_limits
@@ -183,6 +189,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._start: tuple[Array, Array] | None = None  # (q, v) at reset
         self._targets: dict[str, float] = {}
         self._replay: Replay | None = None
+        self.metadata = {**self.metadata, "render_fps": configuration.fps}
+        self._view = configuration.view(self.params) if self._screen else None
         self._bind()
 
     # -- Gymnasium -----------------------------------------------------------------------------
@@ -216,6 +224,9 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._scene.aim(self._memory, self._targets)
         self._replay = None
         self._bind()
+        if self._view is not None:
+            self._view.begin(q, self._configuration.marker(self._targets))
+            self._play()
         return self._observation(), dict(self._targets)
 
     def step(self, action: NDArray[Any]) -> Response:
@@ -225,6 +236,23 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         except TypeError:  # not an array of m numbers: say so, or make it one
             response = self._respond(self._memory, self._as_action(action))
         return self._exception(response, action) if response[2] else response
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The present picture, shape (height, width, 3), in the mode "rgb_array"; "human" shows it in the window."""
+        if self._screen is None or self._view is None:
+            name = self.spec.id if self.spec else "..."
+            gym.logger.warn(
+                "render() shows nothing without a render mode; choose one when the environment is made, such as "
+                f'gym.make("{name}", render_mode="rgb_array")'
+            )
+            return None
+        self._started()
+        return self._screen.show(self._view)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._screen is not None:
+            self._screen.close()
 
     # -- state ---------------------------------------------------------------------------------
 
@@ -291,6 +319,21 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Keep what `step` needs within reach; before reset that is a refusal."""
         kernel = self._scene.kernel
         self._respond = kernel.respond if self._start is not None else _refuse
+        if self._start is not None and self._view is not None:
+            self._respond = self._respond_and_follow
+
+    def _respond_and_follow(self, memory: Array, action: Any) -> Response:
+        """What the kernel does, and the view of it."""
+        response = self._scene.kernel.respond(memory, action)
+        if self._view is not None and response[2] in (RUNNING, TERMINATED):  # something was done, and it is finite
+            self._view.follow(self.q)
+            self._play()
+        return response
+
+    def _play(self) -> None:
+        """In the mode "human", show what is there."""
+        if self.render_mode == "human":
+            self.render()
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the compiled kernel, which is loaded again."""

@@ -141,8 +141,8 @@ class Scene:
 
     def _load(self, kind: str) -> ModuleType:
         specification = self.__getstate__()
-        specification["mechanism"] = self.mechanism.to_dict()
-        specification["task"] = dataclasses.asdict(self.task) if self.task else None
+        specification["mechanism"] = self.mechanism.to_dict(drawing=False)
+        specification["task"] = self.task.to_dict(drawing=False) if self.task else None
         specification["kind"] = kind
         name = f"{self.mechanism.name}_{self.task.name if self.task else 'state'}_{kind}_{self.backend}"
         deriving = tuple(Path(__file__).with_name(f"{part}.py") for part in _DERIVING)

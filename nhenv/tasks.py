@@ -24,13 +24,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name
 from mechanics.mechanism import Mechanism
 
-__all__ = ["POSE", "START", "TASKS", "Task", "get"]
+__all__ = ["MARKER", "POSE", "START", "TASKS", "Task", "get"]
 
 # Names that a mechanism has if it declares a fibre.
 POSE = (
@@ -38,6 +38,7 @@ POSE = (
 )  # fmt: skip
 START = ("x", "y", "heading")
 _WORDS = ("effort", "forward", "dt")
+MARKER = ("x", "y", "heading", "radius")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +57,8 @@ class Task:
         terminated: expression; the episode ends with the step after which it is positive. None: it never does.
         max_episode_steps: steps after which the registered environment truncates.
         any_pose: whether it takes a mechanism that can be brought to rest in any pose nearby, as not all can.
+        marker: where pictures show the target: "x" and "y" in m, and optionally "heading" in rad and "radius" in m, as
+            expressions in targets and weights. No result follows from it.
     """
 
     name: str
@@ -68,6 +71,7 @@ class Task:
     terminated: str | None = None
     max_episode_steps: int
     any_pose: bool = False
+    marker: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not re.fullmatch(r"[A-Z][A-Za-z0-9]*", self.name):
@@ -80,6 +84,7 @@ class Task:
                     f"expression in the targets before it and in x, y and heading at the start; got {rule!r}"
                 )
         self._check_expressions()
+        self._check_marker()
         steps = self.max_episode_steps
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
             raise ValueError(f"task {self.name!r}: max_episode_steps must be a positive whole number, got {steps!r}")
@@ -98,6 +103,17 @@ class Task:
                 raise ValueError(f"a task's data lack {key!r}; they have {', '.join(map(str, data))}")
         rules = {name: tuple(r) if isinstance(r, list) else r for name, r in data.get("targets", {}).items()}
         return cls(**{**data, "targets": rules})
+
+    def to_dict(self, *, drawing: bool = True) -> dict[str, Any]:
+        """Plain data of this task; `from_dict` makes an equal one of it.
+
+        Args:
+            drawing: whether with the marker, from which nothing follows but pictures.
+        """
+        data = asdict(self)
+        if not drawing:
+            del data["marker"]
+        return data
 
     def missing(self, mechanism: Mechanism) -> tuple[str, ...]:
         """Names that this task uses and `mechanism` does not have: none if the task fits."""
@@ -149,6 +165,19 @@ class Task:
                 names_in(text)
         except ExpressionError as error:
             raise ExpressionError(f"task {self.name!r}, {kind}: {error}") from None
+
+    def _check_marker(self) -> None:
+        known = (*self.targets, *self.weights)
+        for key, text in self.marker.items():
+            if key not in MARKER:
+                raise ValueError(f"task {self.name!r}, marker: {unknown_name('key', str(key), MARKER)}")
+            try:
+                for unknown in names_in(text) - set(known):
+                    raise ExpressionError(unknown_name("name", unknown, known))
+            except ExpressionError as error:
+                raise ExpressionError(f"task {self.name!r}, marker, {key}: {error}") from None
+        if self.marker and not {"x", "y"} <= self.marker.keys():
+            raise ValueError(f"task {self.name!r}: a marker needs 'x' and 'y', got {', '.join(self.marker)}")
 
 
 def _is_interval(rule: Any) -> bool:
@@ -224,6 +253,7 @@ TASKS: tuple[Task, ...] = (
         },
         terminated="goal_radius - to_goal",
         max_episode_steps=300,
+        marker={"x": "goal_x", "y": "goal_y", "radius": "goal_radius"},
     ),
     # Paid for being there, not for the way: it is to turn, and to come to rest, on the spot.
     Task(
@@ -268,6 +298,7 @@ TASKS: tuple[Task, ...] = (
         },
         max_episode_steps=160,
         any_pose=True,
+        marker={"x": "start_x", "y": "start_y", "heading": "target_heading", "radius": "offset_tolerance"},
     ),
     # The heading counts near the place only; if it counted everywhere, doing nothing would be the best.
     Task(
@@ -314,6 +345,7 @@ TASKS: tuple[Task, ...] = (
         },
         max_episode_steps=240,
         any_pose=True,
+        marker={"x": "place_x", "y": "place_y", "heading": "target_heading", "radius": "offset_tolerance"},
     ),
 )
 

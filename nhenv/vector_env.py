@@ -81,10 +81,11 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         drag: as for `LocomotionEnv`; a coefficient may be an array (N,).
         torque_limits: as for `LocomotionEnv`; by name, a value may be an array (N,).
         **arguments: the other arguments of `LocomotionEnv`, the same for all rows. Without `whole_state=True`,
-            coordinates that nothing depends on are not followed, and are NaN in `q`.
+            coordinates that nothing depends on are not followed, and are NaN in `q`. With render_mode="rgb_array",
+            which implies it, `render` returns a picture of each row; "human" is for one environment.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own declaration)
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's own)
     _running: Any = None  # closing an environment that could not be made looks for it
 
     @passes_arguments_on
@@ -115,6 +116,13 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         if isinstance(torque_limits, Mapping):
             own_limits = vector_input.arrays("torque_limits", torque_limits, size)
             torque_limits = vector_input.first(torque_limits, own_limits)
+        if arguments.get("render_mode") is not None:
+            if arguments["render_mode"] not in self.metadata["render_modes"]:
+                raise ValueError(
+                    f"render_mode must be None or 'rgb_array', got {arguments['render_mode']!r}; one environment, of "
+                    "gymnasium.make, can be watched in the mode 'human'"
+                )
+            arguments["whole_state"] = True
         # What is made of the first row's numbers serves for all, or checks what they have in common.
         self._configuration = configuration = Configuration(
             mechanism,
@@ -124,10 +132,11 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
             torque_limits=torque_limits,
             **arguments,
         )
+        self.render_mode, self._screen = configuration.render_mode, configuration.screen()
         self.mechanism, self.task = configuration.mechanism, configuration.task
         self.dt, self.joint_limits = configuration.dt, configuration.joint_limits
         self.reset_noise_scale, self.frame = configuration.reset_noise_scale, configuration.scene.frame
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": configuration.fps}
         self._parameters = RowParameters(configuration, size, varied=bool(own_params or own_drag or own_limits))
         kernel = self._kernel
         self._observed = (size, len(kernel.OBSERVATION))
@@ -144,6 +153,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         if self._parameters.varied:
             self._parameters.change(own_params, own_drag, own_limits, np.arange(size), kernel, self._memory)
         self._seeded = self._started = False
+        self._views = [configuration.view(self._params_of(i)) for i in range(size)] if self._screen else []
         self._bind()
 
     # -- Gymnasium -----------------------------------------------------------------------------
@@ -180,6 +190,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
             if part is not None and name in self._kernel.STATES:
                 self._memory.put(f"s_{name}__p", chosen, part[..., place])
         self._choose()
+        self._begin_views(mask)
         return self._observations(), masked((name, values, mask) for name, values in self.targets.items())
 
     def step(self, actions: NDArray[Any]) -> Response:
@@ -196,6 +207,20 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         events = self._run(actions, observations, rewards, terminated, truncated)
         infos = self._infos(events, terminated | truncated) if events or self.info == "all" else {}
         return observations, rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A picture of each row, shape (height, width, 3), in the mode "rgb_array"."""
+        if self._screen is None:
+            name = self.spec.id if self.spec else "..."
+            gym.logger.warn(
+                "render() shows nothing without a render mode; choose one when the environments are made, such as "
+                f'gym.make_vec("{name}", {self.num_envs}, render_mode="rgb_array")'
+            )
+            return None
+        self._require_start()
+        for i, view in enumerate(self._views):
+            view.params = self._params_of(i)  # they may have been changed
+        return tuple(self._screen.show(view) for view in self._views)  # type: ignore[misc]
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let the threads go."""
@@ -330,7 +355,28 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         elif self.autoreset_mode is AutoresetMode.DISABLED and self._memory["over__p"].any():
             self._run = _refuse_over
         else:
-            self._run = self._running
+            self._run = self._run_and_follow if self._views else self._running
+
+    def _run_and_follow(self, *arguments: Any) -> int:
+        """What the kernel does, and the views of it."""
+        events = self._running(*arguments)
+        begun, q = self._memory["steps__p"] == 0, self.q
+        for i in np.flatnonzero(~begun & np.isfinite(q).all(axis=1)).tolist():
+            self._views[i].follow(q[i])
+        self._begin_views(begun)
+        return events
+
+    def _begin_views(self, begun: Bools) -> None:
+        """Tell the views of these rows that an episode begins."""
+        if self._views:
+            q, targets = self.q, self.targets
+            for i in np.flatnonzero(begun).tolist():
+                own = {name: values[i] for name, values in targets.items()}
+                self._views[i].begin(q[i], self._configuration.marker(own))
+
+    def _params_of(self, row: int) -> dict[str, float]:
+        """Parameters of one row."""
+        return {name: float(v[row] if np.ndim(v) else v) for name, v in self._parameters.values.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the compiled kernel and the threads, which are made again."""

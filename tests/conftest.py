@@ -20,6 +20,14 @@ def kernel_cache(tmp_path_factory):
         yield directory
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_windows():
+    """What draws into a window draws into one that nobody sees, with or without a display."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SDL_VIDEODRIVER", "dummy")
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_records():
     """Read a JSON file below tests/data."""

@@ -51,8 +51,8 @@ def settings(env_id: str, code: str, **config: Any) -> dict[str, Any]:
     return {
         "env_id": env_id,
         "max_episode_steps": spec.max_episode_steps,
-        "mechanism": as_mechanism(spec.kwargs["mechanism"]).to_dict(),
-        "task": dataclasses.asdict(tasks.get(spec.kwargs["task"])),
+        "mechanism": as_mechanism(spec.kwargs["mechanism"]).to_dict(drawing=False),
+        "task": tasks.get(spec.kwargs["task"]).to_dict(drawing=False),
         "code": code,
         **{k: dataclasses.asdict(v) if dataclasses.is_dataclass(v) else v for k, v in config.items()},  # type: ignore[arg-type]
     }

@@ -12,6 +12,7 @@ With I_t = I_c + m a^2 + J,
         = F_rear,    J (theta_ddot + delta_ddot) = tau_steer.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["car"]
@@ -61,4 +62,16 @@ car = Mechanism(
     # Rolling and air, and the steering's friction.
     rayleigh="(c_w*(x_dot**2 + y_dot**2) + c_delta*delta_dot**2)/2",
     drag={"c_w": 0.1, "c_delta": 0.002},
+    # The two front wheels steer about one centre of turning (Ackermann), on both sides of the model's single one.
+    bodies={
+        "rear axle": Body("axle", ("x", "y", "theta"), ("L/2", "L/4", "L/10")),
+        "left wheel": Body(
+            "wheel", ("L", "L/4", "atan2(sin(delta), cos(delta) - sin(delta)/4)"), ("L/4", "L/10"), on="rear axle"
+        ),
+        "right wheel": Body(
+            "wheel", ("L", "-L/4", "atan2(sin(delta), cos(delta) + sin(delta)/4)"), ("L/4", "L/10"), on="rear axle"
+        ),
+        "body": Body("rectangle", ("L/2", "0", "0"), ("1.5*L", "0.36*L"), on="rear axle"),
+        "window": Body("rectangle", ("0.65*L", "0", "0"), ("0.2*L", "0.3*L"), on="rear axle", colour="sky"),
+    },
 )

@@ -14,6 +14,7 @@ w = -tau_rotor/(m a v) in the end, so that v^3 grows as 3 <tau_rotor^2> t/(m^2 a
 Bizyaev, Borisov, Kozlov and Mamaev.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["chaplygin_beanie"]
@@ -48,4 +49,10 @@ chaplygin_beanie = Mechanism(
     observation={"theta_dot": "theta_dot/2", "phi_dot": "phi_dot/10", "speed": "speed"},
     rayleigh="(c_w*(x_dot**2 + y_dot**2) + c_phi*phi_dot**2)/2",
     drag={"c_w": 0.05, "c_phi": 0.001},
+    bodies={
+        "body": Body("disc", ("x + a*cos(theta)", "y + a*sin(theta)", "theta"), ("3.2*a", "2.2*a")),
+        "wheel": Body("wheel", ("-a", "0", "0"), ("0.9*a", "0.2*a"), on="body"),
+        "rotor": Body("rectangle", ("0", "0", "phi"), ("1.9*a", "0.3*a"), on="body", colour="orange"),
+        "bearing": Body("disc", ("0", "0", "0"), ("0.5*a", "0.5*a"), on="body", colour="orange"),
+    },
 )

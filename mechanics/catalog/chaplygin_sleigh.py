@@ -13,6 +13,7 @@ of mass in front, v = v_m tanh(k t) and w = w_m sech(k t) with k = m a v_m/I. On
 by the angle pi sqrt(I/(m a^2)) in all, and goes on forwards.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["chaplygin_sleigh"]
@@ -43,4 +44,9 @@ chaplygin_sleigh = Mechanism(
     # The edge drags along its line, and where it is turned on the spot.
     rayleigh="(c_w*(x_dot**2 + y_dot**2) + c_theta*theta_dot**2)/2",
     drag={"c_w": 0.1, "c_theta": 0.005},
+    bodies={
+        "body": Body("rectangle", ("x + a*cos(theta)", "y + a*sin(theta)", "theta"), ("2.8*a", "1.6*a")),
+        "centre of mass": Body("disc", ("0", "0", "0"), ("0.3*a", "0.3*a"), on="body", colour="orange"),
+        "edge": Body("wheel", ("-a", "0", "0"), ("0.9*a", "0.14*a"), on="body"),
+    },
 )

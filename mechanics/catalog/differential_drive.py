@@ -13,6 +13,7 @@ With v the speed along the heading, w = theta_dot (Sarkar, Yun and Kumar; Dhaoua
 a Chaplygin sleigh with heavier inertia, so that it runs straight only with the centre of mass in front.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["differential_drive"]
@@ -50,4 +51,12 @@ differential_drive = Mechanism(
     # Friction of the two motors and gears.
     rayleigh="c_m*(phi_r_dot**2 + phi_l_dot**2)/2",
     drag={"c_m": 0.0005},
+    bodies={
+        "body": Body("disc", ("x", "y", "theta"), ("2*b", "2*b")),
+        "nose": Body("bar", ("0", "0", "0"), ("b", "0.08*b"), on="body", colour="sky"),
+        "right wheel": Body("wheel", ("0", "-b", "0"), ("2*r", "0.5*r"), on="body"),
+        "left wheel": Body("wheel", ("0", "b", "0"), ("2*r", "0.5*r"), on="body"),
+        "right mark": Body("disc", ("r*sin(phi_r)", "-b", "0"), ("0.4*r", "0.4*r"), on="body", colour="orange"),
+        "left mark": Body("disc", ("r*sin(phi_l)", "b", "0"), ("0.4*r", "0.4*r"), on="body", colour="orange"),
+    },
 )

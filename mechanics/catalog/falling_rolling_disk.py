@@ -14,6 +14,7 @@ which is v^2 > g r/3 for a thin uniform disk; below, it falls. The energy is con
 frame have a pole where the disk lies flat, beyond the stops of phi: skids on both sides.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["falling_rolling_disk"]
@@ -68,4 +69,16 @@ falling_rolling_disk = Mechanism(
     # Rolling and pivoting on a soft ground.
     rayleigh="(c_psi*psi_dot**2 + c_theta*theta_dot**2)/2",
     drag={"c_psi": 0.004, "c_theta": 0.004},
+    # Seen from above: the ellipse of the rim, whose middle lies to the right of the contact when the disk leans there.
+    bodies={
+        "disk": Body(
+            "disc",
+            ("x + r*sin(phi)*sin(theta)", "y - r*sin(phi)*cos(theta)", "theta"),
+            ("2*r", "r*(0.16 + 2*abs(sin(phi)))"),
+        ),
+        "contact": Body("wheel", ("x", "y", "theta"), ("r", "0.1*r")),
+        "mark": Body(
+            "disc", ("r*sin(psi)", "-r*cos(psi)*sin(phi)", "0"), ("0.24*r", "0.24*r"), on="disk", colour="orange"
+        ),
+    },
 )

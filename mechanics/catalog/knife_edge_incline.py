@@ -13,6 +13,7 @@ with h = g sin(alpha)/(2 w^2): it never gets further down than h. To go forward 
 largest push is half of the weight along the slope, too little to climb straight and enough to climb askew.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["knife_edge_incline"]
@@ -44,4 +45,9 @@ knife_edge_incline = Mechanism(
     forward="-1",
     rayleigh="(c_w*(x_dot**2 + y_dot**2) + c_theta*theta_dot**2)/2",
     drag={"c_w": 0.1, "c_theta": 0.01},
+    # Twice the radius of gyration of a plate is its width, more or less.
+    bodies={
+        "plate": Body("disc", ("x", "y", "theta"), ("3*sqrt(J/m)", "1.5*sqrt(J/m)")),
+        "edge": Body("wheel", ("0", "0", "0"), ("2.4*sqrt(J/m)", "0.12*sqrt(J/m)"), on="plate"),
+    },
 )

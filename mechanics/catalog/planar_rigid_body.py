@@ -5,6 +5,7 @@ through the centre of mass; u_2 pushes sideways at the distance h behind it, so 
 turns the body to the right.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["planar_rigid_body"]
@@ -37,4 +38,10 @@ planar_rigid_body = Mechanism(
     # The air under the skirt.
     rayleigh="(c_v*(x_dot**2 + y_dot**2) + c_w*theta_dot**2)/2",
     drag={"c_v": 0.2, "c_w": 0.005},
+    bodies={
+        "skirt": Body("disc", ("x", "y", "theta"), ("3.6*h", "2.4*h"), colour="grey"),
+        "hull": Body("disc", ("0", "0", "0"), ("3*h", "1.8*h"), on="skirt"),
+        "bow": Body("bar", ("0.6*h", "0", "0"), ("0.7*h", "0.2*h"), on="skirt", colour="sky"),
+        "thruster": Body("rectangle", ("-h", "0", "pi/2"), ("0.8*h", "0.3*h"), on="skirt", colour="orange"),
+    },
 )

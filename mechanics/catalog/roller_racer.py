@@ -4,6 +4,7 @@ Two links with an axle each and a torque on the joint between them. (x, y, theta
 the body, psi the angle of the front link relative to it; the front link has inertia I_2 and no mass.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["roller_racer"]
@@ -62,6 +63,16 @@ roller_racer = Mechanism(
     " + C*(cos(theta + psi)*x_dot + sin(theta + psi)*y_dot + l_1*sin(psi)*theta_dot)**2 + b_psi*psi_dot**2)/2",
     drag={"C": 0.3, "b_psi": 0.02},
     observation={"psi": "psi/1.2", "psi_dot": "psi_dot/10", "speed": "speed"},
+    bodies={
+        "axle": Body("axle", ("x", "y", "theta"), ("0.8*l_1", "0.4*l_1", "0.12*l_1")),
+        "front axle": Body(
+            "axle", ("l_1 + l_2*cos(psi)", "l_2*sin(psi)", "psi"), ("l_1", "0.3*l_1", "0.1*l_1"), on="axle"
+        ),
+        "body": Body("rectangle", ("l_1/12", "0", "0"), ("0.6*l_1", "0.5*l_1"), on="axle"),
+        "frame": Body("bar", ("0", "0", "0"), ("l_1", "0.14*l_1"), on="axle"),
+        "link": Body("bar", ("l_1", "0", "psi"), ("l_2", "0.14*l_1"), on="axle", colour="orange"),
+        "joint": Body("disc", ("l_1", "0", "0"), ("0.2*l_1", "0.2*l_1"), on="axle", colour="orange"),
+    },
     # A heavy body with a light front link is driven away from that link.
     forward="l_1*I_2 - l_2*I_1",
 )

@@ -5,6 +5,7 @@ As `roller_racer`, but for the link's mass m_2 at the distance d from the joint,
 link's mass does not change the direction in which the racer is driven.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["roller_racer_massive"]
@@ -57,6 +58,19 @@ roller_racer_massive = Mechanism(
     joint_limits={"psi": 1.2},
     torque_limits={"u_psi": 0.4},
     observation={"psi": "psi/1.2", "psi_dot": "psi_dot/10", "speed": "speed"},
+    bodies={
+        "axle": Body("axle", ("x", "y", "theta"), ("0.8*l_1", "0.4*l_1", "0.12*l_1")),
+        "front axle": Body(
+            "axle", ("l_1 + l_2*cos(psi)", "l_2*sin(psi)", "psi"), ("l_1", "0.3*l_1", "0.1*l_1"), on="axle"
+        ),
+        "body": Body("rectangle", ("l_1/12", "0", "0"), ("0.6*l_1", "0.5*l_1"), on="axle"),
+        "frame": Body("bar", ("0", "0", "0"), ("l_1", "0.14*l_1"), on="axle"),
+        "link": Body("bar", ("l_1", "0", "psi"), ("l_2", "0.14*l_1"), on="axle", colour="orange"),
+        "mass": Body(
+            "disc", ("l_1 + d*cos(psi)", "d*sin(psi)", "psi"), ("0.3*l_1", "0.3*l_1"), on="axle", colour="orange"
+        ),
+        "joint": Body("disc", ("l_1", "0", "0"), ("0.2*l_1", "0.2*l_1"), on="axle", colour="yellow"),
+    },
     # Sign of the force along the axis that swinging the straight joint gives.
     forward="l_1*I_2 - l_2*I_1 + m_2*l_1*(l_2 - d)*(l_2 - d - l_1)",
     # Both axles roll with friction, the front one at the speed of its own wheels.

@@ -15,6 +15,7 @@ With v the speed along the edge, w = theta_dot and W = theta_dot + phi_dot the a
 With l = 0 it is the Chaplygin beanie. Unlike the beanie's, its speed can fall.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["sleigh_with_arm"]
@@ -58,4 +59,10 @@ sleigh_with_arm = Mechanism(
     },
     rayleigh="(c_w*(x_dot**2 + y_dot**2) + c_phi*phi_dot**2)/2",
     drag={"c_w": 0.05, "c_phi": 0.002},
+    bodies={
+        "body": Body("rectangle", ("x + a*cos(theta)", "y + a*sin(theta)", "theta"), ("2.8*a", "1.6*a")),
+        "edge": Body("wheel", ("-a", "0", "0"), ("0.9*a", "0.2*a"), on="body"),
+        "arm": Body("bar", ("-a", "0", "phi"), ("l", "0.14*l"), on="body", colour="orange"),
+        "mass": Body("disc", ("l", "0", "0"), ("0.35*l", "0.35*l"), on="arm", colour="orange"),
+    },
 )

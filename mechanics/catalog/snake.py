@@ -13,6 +13,7 @@ equal, and the axles meet in a point or are parallel.
 
 from fractions import Fraction
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Matrix, Mechanism, MechanismError
 
 __all__ = ["n_link_snake", "snake"]
@@ -57,6 +58,7 @@ def n_link_snake(n: int, name: str | None = None) -> Mechanism:
         },
         rayleigh=_rayleigh(angles),
         drag={"c_w": 0.05, "c_j": 0.005},
+        bodies=_bodies(angles),
     )
 
 
@@ -112,6 +114,20 @@ def _rayleigh(angles: tuple[str, ...]) -> str:
     ]
     rates = [f"{angles[i + 1]}_dot - {angles[i]}_dot" for i in links[:-1]]
     return f"(c_w*({_squares(speeds)}) + c_j*({_squares(rates)}))/2"
+
+
+def _bodies(angles: tuple[str, ...]) -> dict[str, Body]:
+    """A link is a bar from joint to joint on its axle; the head is of another colour."""
+    bodies: dict[str, Body] = {}
+    for i, angle in enumerate(angles):
+        pose = ("x", "y", "theta")
+        if i:
+            joint = f"{angle} - {angles[i - 1]}"
+            pose = (f"L/2 + L/2*cos({joint})", f"L/2*sin({joint})", joint)
+        axle, colour = f"axle {i + 1}", "orange" if i == len(angles) - 1 else "blue"
+        bodies[axle] = Body("axle", pose, ("0.5*L", "0.28*L", "0.09*L"), on=f"axle {i}" if i else "")
+        bodies[f"link {i + 1}"] = Body("rectangle", ("0", "0", "0"), ("0.94*L", "0.16*L"), on=axle, colour=colour)
+    return bodies
 
 
 def _squares(texts: list[str]) -> str:

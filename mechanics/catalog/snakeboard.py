@@ -5,6 +5,7 @@ A board with a rotor on it and wheel axles that steer in opposite directions by 
 both relative to the board.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["snakeboard"]
@@ -62,4 +63,17 @@ snakeboard = Mechanism(
     " + b_psi*psi_dot**2 + b_phi*phi_dot**2)/2",
     drag={"C": 1.2, "b_psi": 0.05, "b_phi": 0.02},
     observation={"phi": "phi/1.2", "phi_dot": "phi_dot/10", "psi_dot": "psi_dot/10", "speed": "speed"},
+    bodies={
+        "front truck": Body(
+            "axle", ("x + l*cos(theta)", "y + l*sin(theta)", "theta - phi"), ("0.8*l", "0.4*l", "0.14*l")
+        ),
+        "rear truck": Body(
+            "axle", ("x - l*cos(theta)", "y - l*sin(theta)", "theta + phi"), ("0.8*l", "0.4*l", "0.14*l")
+        ),
+        "board": Body("rectangle", ("x", "y", "theta"), ("1.5*l", "0.36*l")),
+        "front foot": Body("disc", ("l", "0", "-phi"), ("0.5*l", "0.4*l"), on="board", colour="sky"),
+        "rear foot": Body("disc", ("-l", "0", "phi"), ("0.5*l", "0.4*l"), on="board", colour="sky"),
+        "rotor": Body("rectangle", ("0", "0", "psi"), ("1.4*l", "0.14*l"), on="board", colour="orange"),
+        "bearing": Body("disc", ("0", "0", "0"), ("0.24*l", "0.24*l"), on="board", colour="orange"),
+    },
 )

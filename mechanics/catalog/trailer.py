@@ -15,6 +15,7 @@ J_0 theta_ddot = tau_tractor with N = m_0 + sum_i (m_i p_i^2 + J_i w_i^2). Pulle
 back, they jackknife.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism, MechanismError
 
 __all__ = ["n_trailer", "trailer"]
@@ -99,12 +100,31 @@ def n_trailer(n: int, name: str | None = None) -> Mechanism:
         # Axle i rolls with p_i times the speed of the tractor.
         rayleigh=f"(c_w*({rolling})*(x_dot**2 + y_dot**2) + c_theta*theta_dot**2)/2",
         drag={"c_w": 0.1, "c_theta": 0.02},
+        bodies=_bodies(angles),
     )
 
 
 def _masses(first: int, last: int) -> str:
     """Sum of the masses of the axles from first to last."""
     return " + ".join(f"m_{i}" for i in range(first, last + 1))
+
+
+def _bodies(angles: tuple[str, ...]) -> dict[str, Body]:
+    """The tractor, and trailers whose bars reach to the axle that pulls them."""
+    bodies = {
+        "axle": Body("axle", ("x", "y", "theta"), ("0.28", "0.14", "0.04")),
+        "tractor": Body("rectangle", ("0.06", "0", "0"), ("0.3", "0.18"), on="axle"),
+        "window": Body("rectangle", ("0.12", "0", "0"), ("0.06", "0.14"), on="axle", colour="sky"),
+    }
+    pulling = "axle"
+    for i, angle in enumerate(angles[1:], 1):
+        hitch = f"{angle} - {angles[i - 1]}"
+        axle, size = f"axle {i}", ("0.26", "0.11", "0.035")
+        bodies[axle] = Body("axle", (f"-d_{i}*cos({hitch})", f"-d_{i}*sin({hitch})", hitch), size, on=pulling)
+        bodies[f"bar {i}"] = Body("bar", ("0", "0", "0"), (f"d_{i}", "0.025"), on=axle, colour="grey")
+        bodies[f"trailer {i}"] = Body("rectangle", ("0", "0", "0"), ("0.22", "0.16"), on=axle, colour="orange")
+        pulling = axle
+    return bodies
 
 
 trailer = n_trailer(2, "trailer")

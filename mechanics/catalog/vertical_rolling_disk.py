@@ -11,6 +11,7 @@ All generalized Christoffel symbols vanish (Bloch, 1.4):
 and without torque the disk rolls on a circle of radius R phi_dot/theta_dot.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["vertical_rolling_disk"]
@@ -44,4 +45,15 @@ vertical_rolling_disk = Mechanism(
     observation={"theta_dot": "theta_dot/2", "speed": "speed"},
     rayleigh="(c_phi*phi_dot**2 + c_theta*theta_dot**2)/2",
     drag={"c_phi": 0.003, "c_theta": 0.001},
+    bodies={
+        "disk": Body("wheel", ("x", "y", "theta"), ("2*R", "0.16*R")),
+        # A mark on the rim, as far ahead of the axle as it is, and small where it is below.
+        "mark": Body(
+            "disc",
+            ("R*sin(phi)", "0", "0"),
+            ("R*(0.2 + 0.1*cos(phi))", "R*(0.2 + 0.1*cos(phi))"),
+            on="disk",
+            colour="orange",
+        ),
+    },
 )

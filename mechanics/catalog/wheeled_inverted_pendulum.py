@@ -10,6 +10,7 @@ moment before it can go on, and leans forward as long as it speeds up: it stays 
 belongs to it. Skids stop the body on both sides.
 """
 
+from mechanics.bodies import Body
 from mechanics.mechanism import Mechanism
 
 __all__ = ["wheeled_inverted_pendulum"]
@@ -81,4 +82,16 @@ wheeled_inverted_pendulum = Mechanism(
     # Bearings of the motors, and rolling.
     rayleigh="(c_m*(psi_r_dot**2 + psi_l_dot**2) + c_w*(x_dot**2 + y_dot**2))/2",
     drag={"c_m": 0.003, "c_w": 0.05},
+    # The head, twice as high as the centre, shows the lean.
+    bodies={
+        "wheels": Body("axle", ("x", "y", "theta"), ("2*b", "2*r", "0.3*r")),
+        "right mark": Body(
+            "disc", ("r*sin(alpha + psi_r)", "-b", "0"), ("0.24*r", "0.24*r"), on="wheels", colour="orange"
+        ),
+        "left mark": Body(
+            "disc", ("r*sin(alpha + psi_l)", "b", "0"), ("0.24*r", "0.24*r"), on="wheels", colour="orange"
+        ),
+        "body": Body("rectangle", ("l*sin(alpha)", "0", "0"), ("0.6*r + 2*l*abs(sin(alpha))", "1.3*b"), on="wheels"),
+        "head": Body("disc", ("2*l*sin(alpha)", "0", "0"), ("0.7*r", "0.7*b"), on="wheels", colour="sky"),
+    },
 )

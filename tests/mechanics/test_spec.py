@@ -66,8 +66,14 @@ def toml(spec):
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in spec.items() if key not in tables]
     for key, table in tables.items():
         lines.append(f"[{key}]")
-        lines += [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in table.items()]
+        lines += [f"{json.dumps(name)} = {inline(value)}" for name, value in table.items()]
     return "\n".join(lines)
+
+
+def inline(value):
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name} = {inline(entry)}' for name, entry in value.items())}}}"
+    return json.dumps(value, ensure_ascii=False)
 
 
 @pytest.mark.parametrize(("suffix", "dumps"), [(".toml", toml), (".json", json.dumps), (".JSON", json.dumps)])

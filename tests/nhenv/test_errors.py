@@ -81,6 +81,10 @@ ARGUMENTS = {
     "kept energy, a force that turns": (
         "nhenv/CarForward-v0", {"keep_energy": True}, ValueError, ["'F_rear'", "theta", "keep_energy=False"],
     ),
+    "picture of one number": (RACER, {"render_size": 640}, ValueError, ["render_size", "(width, height)", "640"]),
+    "picture too small": (RACER, {"render_size": (640, 16)}, ValueError, ["render_size", "32 to 2048", "(640, 16)"]),
+    "picture too large": (RACER, {"render_size": (640, 5000)}, ValueError, ["render_size", "32 to 2048", "5000"]),
+    "picture of half a pixel": (RACER, {"render_size": (640, 40.5)}, ValueError, ["height", "whole", "40.5"]),
     "joint limit bare": (RACER, {"joint_limits": 1.0}, ValueError, ["joint_limits", "True, False", "1.0"]),
 }  # fmt: skip
 
@@ -97,13 +101,7 @@ def test_every_kind_of_argument_is_refused_somewhere():
     tried = {name for _, arguments, _, _ in ARGUMENTS.values() for name in arguments}
     named = inspect.signature(LocomotionEnv).parameters
     tried -= {"ctrl_cost_weight", "ctrl_cost_wieght", "torque_limit"}
-    assert tried == set(named) - {"render_mode", "weights"}
-
-
-def test_drawing_is_refused():
-    with pytest.raises(ValueError, match="render_mode") as error:
-        LocomotionEnv("snakeboard", render_mode="human")
-    _message(error, "None", "'human'", "do not draw")
+    assert tried == set(named) - {"render_mode", "weights"}  # its case is in test_render.py
 
 
 # -- reset --------------------------------------------------------------------------------------

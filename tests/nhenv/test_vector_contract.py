@@ -616,7 +616,7 @@ ARGUMENTS = {
     "argument misspelt": ({"thread": 2}, TypeError, ["'thread'", "argument"]),
     "weight misspelt": ({"ctrl_cost_wieght": 0.1}, TypeError, ["'ctrl_cost_wieght'", "mean 'ctrl_cost_weight'"]),
     "whole_state": ({"whole_state": "yes"}, ValueError, ["whole_state", "True or False", "'yes'"]),
-    "drawing": ({"render_mode": "human"}, ValueError, ["render_mode", "do not draw"]),
+    "drawing": ({"render_mode": "human"}, ValueError, ["render_mode", "'rgb_array'", "'human'"]),
     "parameter misspelt": ({"params": {"J_rr": np.full(N, 0.1)}}, MechanismError, ["'J_rr'", "mean 'J_r'"]),
     "parameter shape": ({"params": {"m": np.ones(4)}}, ValueError, ["params: m", "(3,)", "(4,)"]),
     "parameter ragged": ({"params": {"m": [1.0, [2.0], 3]}}, ValueError, ["params: m", "3 of them"]),
