@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import math
 import pickle
 import sys
 import time
@@ -51,18 +52,21 @@ class Linear:
 
 
 class Run(BaseCallback):
-    """Draws the learning curve and keeps checkpoints, between an update and the next rollout.
+    """Draws the learning curve and keeps checkpoints and the best policy, between an update and the next rollout.
 
     There, the model, the environments and the random generators are all that there is to remember.
 
     Attributes:
         curve: points {"steps", "cpu_s", "return", "distance_m"} of the deterministic policy.
+        best: the policy's parameters at the point with the largest return, and that point's steps. Gaits are chosen on
+            the same starts; nobody is judged on them.
     """
 
     def __init__(self, env_id: str, config: PPOConfig, checkpoint: Path, report: Report) -> None:
         super().__init__()
         self.config, self.checkpoint, self.report = config, checkpoint, report
         self.curve: list[dict[str, float]] = []
+        self.best: dict[str, Any] = {"steps": 0, "return": -math.inf, "parameters": {}}
         self._envs = make_envs(env_id, config.curve_episodes, whole_state=True, **config.env_kwargs)
         self._before = {"wall_s": 0.0, "cpu_s": 0.0}  # spent before an interruption
         self._began = _clocks()
@@ -95,6 +99,9 @@ class Run(BaseCallback):
         numbers = measure(self._envs, rollout(PolicyController(self.model), self._envs, seeds))
         point = {"steps": self.model.num_timesteps, "cpu_s": self.spent["cpu_s"]}
         self.curve.append(point | {name: float(numbers[name].mean()) for name in ("return", "distance_m")})
+        if self.curve[-1]["return"] > self.best["return"]:
+            parameters = {name: value.clone() for name, value in self.model.policy.state_dict().items()}
+            self.best = {name: self.curve[-1][name] for name in ("steps", "return")} | {"parameters": parameters}
 
     def save(self) -> None:
         """Write everything that the rest of the run depends on."""
@@ -106,6 +113,7 @@ class Run(BaseCallback):
             "torch": torch.get_rng_state(),
             "numpy": np.random.get_state(),  # noqa: NPY002 (SB3 shuffles its minibatches with it)
             "curve": self.curve,
+            "best": self.best,
             "spent": self.spent,
         }
         write_bytes(self.checkpoint, pickle.dumps(state))
@@ -114,7 +122,7 @@ class Run(BaseCallback):
         """Go on where `save` was called. This unpickles a file of our own."""
         state = pickle.loads(self.checkpoint.read_bytes())  # noqa: S301
         model = PPO.load(io.BytesIO(state["model"]), env=state["envs"], device="cpu", force_reset=False)
-        self.curve, self._before = state["curve"], state["spent"]
+        self.curve, self.best, self._before = state["curve"], state["best"], state["spent"]
         torch.set_rng_state(state["torch"])  # last: making the model drew random numbers
         np.random.set_state(state["numpy"])  # noqa: NPY002
         return model
@@ -122,10 +130,11 @@ class Run(BaseCallback):
 
 def make_envs_to_learn_in(env_id: str, config: PPOConfig, seed: int) -> VecEnv:
     """Environments with the starts and the scale of rewards that the settings ask for."""
-    envs: VecEnv = make_sb3_vec_env(check_env_id(env_id), config.n_envs, **config.env_kwargs)
+    plain = make_sb3_vec_env(check_env_id(env_id), config.n_envs, **config.env_kwargs)
+    envs: VecEnv = plain
     if config.start_energy:
         steps = round(config.start_share * config.timesteps)
-        envs = MovingStarts(envs, config.start_energy, steps, training_seed(seed))
+        envs = MovingStarts(plain, config.start_energy, steps, training_seed(seed))
     return ScaledReward(envs, config.reward_scale)
 
 
@@ -172,10 +181,12 @@ def train_piece(env_id: str, config: PPOConfig, seed: int, out: Path, report: Re
     model.set_logger(Logger(None, []))  # else each run leaves a folder in the system's temporary one
     model.learn(config.timesteps - model.num_timesteps, callback=run, reset_num_timesteps=False)
     run.draw()
+    model.policy.load_state_dict(run.best["parameters"])
     policy = io.BytesIO()
     model.save(policy)
     write_bytes(path.with_suffix(".zip"), policy.getvalue())
-    result = {"curve": run.curve, "steps": model.num_timesteps, **run.spent, "versions": versions()}
+    steps = {"steps": model.num_timesteps, "best_steps": run.best["steps"]}
+    result = {"curve": run.curve, **steps, **run.spent, "versions": versions()}
     write_json(path, {"settings": ppo_settings(env_id, config, seed), "result": result})
     run.checkpoint.unlink(missing_ok=True)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -16,7 +19,17 @@ __all__ = ["MovingStarts", "ScaledReward"]
 Array = NDArray[np.float64]
 
 
-class ScaledReward(VecEnvWrapper):
+class _Pickled(VecEnvWrapper):
+    """A wrapper that can be pickled with what it wraps: all but a table of its class's members."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, class_attributes=dict(inspect.getmembers(type(self))))
+
+
+class ScaledReward(_Pickled):
     """Multiplies rewards.
 
     `VecNormalize` finds a factor by itself, but cannot be pickled with its environments, as checkpoints need.
@@ -40,7 +53,7 @@ class ScaledReward(VecEnvWrapper):
         return observations, self.factor * rewards, dones, infos
 
 
-class MovingStarts(VecEnvWrapper):
+class MovingStarts(_Pickled):
     """Begins a share of the episodes in motion; the share falls from 1 to 0.
 
     At rest nothing tells a policy what momentum is worth. One that has begun in motion often enough knows, and then

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from training.config import PPOConfig
-from training.evaluate import load_policy
+from training.config import TUNING_SEEDS, PPOConfig
+from training.evaluate import load_policy, make_envs, rollout
 from training.progress import Interrupted, ignore
 from training.store import read_json
 from training.train import Linear, Run, make_model, ppo_path, train_piece
@@ -77,7 +77,20 @@ def test_history_says_how_the_policy_came_about(uninterrupted):
     assert written["settings"]["seed"] == 0
     assert written["result"]["steps"] == TINY.timesteps
     assert [point["steps"] for point in written["result"]["curve"]] == [0, 256, 512, 768, 1024, 1280]
+    assert (
+        written["result"]["best_steps"] == max(written["result"]["curve"], key=lambda point: point["return"])["steps"]
+    )
     assert written["result"]["versions"].keys() >= {"torch", "stable_baselines3", "numpy"}
+
+
+def test_the_best_policy_of_the_curve_is_kept(uninterrupted):
+    """It has the return of that point again, on the same starts."""
+    path = ppo_path(SNAKEBOARD, TINY, 0, uninterrupted)
+    best = max(read_json(path)["result"]["curve"], key=lambda point: point["return"])
+    assert best["steps"] not in (0, TINY.timesteps)  # or this test shows less than it says
+    envs = make_envs(SNAKEBOARD, TINY.curve_episodes, whole_state=True)
+    again = rollout(load_policy(path.with_suffix(".zip")), envs, [TUNING_SEEDS])
+    assert again.returns.mean() == best["return"]
 
 
 def test_settings_reach_the_algorithm():
