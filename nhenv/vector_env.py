@@ -262,6 +262,11 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         return self._kernel.OBSERVATION
 
     @property
+    def substeps(self) -> int:
+        """Steps of the integrator in a hold, where its error needs no more."""
+        return int(self._kernel.SUBSTEPS)
+
+    @property
     def targets(self) -> dict[str, Array]:
         """The task's targets in the present episodes, by name, shape (N,): those that something depends on."""
         self._require_start()

@@ -9,12 +9,15 @@ them in one harness and writes results.json, results.md and a figure for each en
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import importlib.util
 import os
 import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +27,19 @@ import tyro
 from rich.console import Console
 
 from training import config as settings_of
-from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id, training_seed
-from training.evaluate import METRICS, Controller, Rollout, evaluate, load_policy, make_envs, summary
+from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id
+from training.evaluate import Controller, Rollout, evaluate, load_policy, make_envs
 from training.gaits import gait_path, sinusoid, tune_piece
+from training.metrics import headline, metrics_of
+from training.options import Seeds, check_seeds
 from training.plots import GAITS, POLICY, Shown, draw
 from training.progress import Job, run_jobs
 from training.report import markdown, tables
+from training.statistics import median_run, seconds_to_pass, summary
 from training.store import machine, read_json, versions, write_bytes, write_json
-from training.train import ppo_path, train_piece
+from training.train import check_tensorboard, ppo_path, train_piece
 
-__all__ = ["Compare", "compare", "judge"]
+__all__ = ["Compare", "compare", "judge", "strongest_known"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,31 +48,31 @@ class Compare:
 
     Attributes:
         env_ids: environments.
-        seeds: numbers of the PPO runs on each.
+        seeds: numbers of the PPO runs on each; 0-9 is short for ten of them.
         timesteps: environment steps of a PPO run; None for the settings of the task.
         drag: let the mechanisms' drag act.
         out: folder of the results. What is finished in it is used again if its settings are the same.
         processes: processes side by side.
+        tensorboard: folder of TensorBoard's files; None for none.
         quick: far too short runs, to see that everything works.
     """
 
     env_ids: tuple[str, ...] = settings_of.COMPARED
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: Seeds = (0, 1, 2)
     timesteps: int | None = None
     drag: bool = False
     out: Path = Path("runs/compare")
     processes: int = os.cpu_count() or 1
+    tensorboard: Path | None = None
     quick: bool = False
 
     def __post_init__(self) -> None:
         for env_id in self.env_ids:
             check_env_id(env_id)
-        for seed in self.seeds:
-            training_seed(seed)
+        check_seeds(self.seeds)
+        check_tensorboard(self.tensorboard)
         if self.processes < 1:
             raise ValueError(f"processes must be at least 1, got {self.processes}")
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds must be different numbers, at least one, got {self.seeds}")
 
     def config(self, env_id: str) -> TaskConfig:
         """Settings for an environment."""
@@ -82,6 +88,7 @@ class Compare:
     def jobs(self) -> list[Job]:
         """What is not done yet."""
         gaits, runs = [], []
+        train = partial(train_piece, tensorboard=self.tensorboard)
         for env_id in self.env_ids:
             config, name = self.config(env_id), env_id.rpartition("/")[2]
             for label, gait in config.gaits.items():
@@ -89,7 +96,7 @@ class Compare:
                     gaits.append(Job(f"{name} {label}", tune_piece, (env_id, gait, self.out)))
             for seed in self.seeds:
                 if not ppo_path(env_id, config.ppo, seed, self.out).exists():
-                    runs.append(Job(f"{name} PPO seed {seed}", train_piece, (env_id, config.ppo, seed, self.out)))
+                    runs.append(Job(f"{name} PPO seed {seed}", train, (env_id, config.ppo, seed, self.out)))
         return gaits + runs
 
 
@@ -116,29 +123,49 @@ def compare(options: Compare, command: Sequence[str], console: Console) -> dict[
     return results
 
 
+def strongest_known(env_id: str, env_kwargs: Mapping[str, Any]) -> float | None:
+    """Distance in m that direct optimal control reaches; None where it was not asked, or in another environment."""
+    if set(env_kwargs) - {"drag"} or not isinstance(env_kwargs.get("drag", False), bool):
+        return None
+    if importlib.util.find_spec("training.optimal") is None:
+        return None
+    distance: float | None = importlib.import_module("training.optimal").reference(
+        env_id, env_kwargs.get("drag", False)
+    )
+    return distance
+
+
 def judge(env_id: str, options: Compare) -> dict[str, Any]:
     """Evaluate the gaits and the policies on one environment, and draw its figure."""
     config, out, name = options.config(env_id), options.out, env_id.rpartition("/")[2]
-    envs = make_envs(env_id, 1)
+    envs = make_envs(env_id, 1, **config.evaluation.env_kwargs)
+    first, metrics = headline(envs.task), metrics_of(envs.task)
     shown: list[Shown] = []
-    gaits, policies, curves = {}, [], {}
+    gaits, policies, curves, rollouts, scores = {}, [], [], [], []
     for label, gait in config.gaits.items():
         path = gait_path(env_id, gait, out)
         tuned = read_json(path)["result"]
         controller = sinusoid(make_envs(env_id, 1, **gait.env_kwargs), gait, tuned["vector"])
-        episodes, gaits[label] = _judged(controller, env_id, config, path, tuned)
-        shown.append(Shown(label, GAITS[len(shown)], episodes))
+        episodes, gaits[label], _ = _judged(controller, env_id, config, path, tuned)
+        shown.append(Shown(label, GAITS[len(shown) % len(GAITS)], episodes))
     for seed in options.seeds:
         path = ppo_path(env_id, config.ppo, seed, out)
         trained = read_json(path)["result"]
-        episodes, policy = _judged(load_policy(path.with_suffix(".zip")), env_id, config, path, trained)
+        episodes, policy, numbers = _judged(load_policy(path.with_suffix(".zip")), env_id, config, path, trained)
         policies.append({"seed": seed} | policy)
-        curves[f"PPO, seed {seed}"] = trained["curve"]
-        if len(policies) == 1:  # the first seed, not the best one
-            shown.append(Shown(f"PPO, seed {seed}", POLICY, episodes))
-    reached = {label: gait["distance_m"]["mean"] for label, gait in gaits.items()}
+        curves.append(trained["curve"])
+        rollouts.append(episodes)
+        scores.append(numbers)
+    estimates = [policy[first.name]["estimate"] for policy in policies]
+    middle = median_run(estimates, first.better)
+    shown.append(Shown(f"PPO, seed {options.seeds[middle]}", POLICY, rollouts[middle]))
+    reached = {label: gait[first.name]["estimate"] for label, gait in gaits.items()}
     draw(out / f"{name}.png", name, envs, shown, curves, reached)
-    distances = [policy["distance_m"]["mean"] for policy in policies]
+    over_seeds = {
+        metric.name: summary(np.array([numbers[metric.name] for numbers in scores]), metric.statistic)
+        for metric in metrics
+    }
+    fine = summary(np.array([numbers["finely_integrated"] for numbers in scores]), first.statistic)
     return {
         "config": dataclasses.asdict(config),
         "seeds": {
@@ -147,24 +174,40 @@ def judge(env_id: str, options: Compare) -> dict[str, Any]:
             "tuning": TUNING_SEEDS,
             "evaluation": EVALUATION_SEEDS,
         },
+        "headline": first.name,
+        "statistics": {metric.name: metric.statistic for metric in metrics},
+        "reference": strongest_known(env_id, config.evaluation.env_kwargs) if first.name == "distance_m" else None,
         "gaits": gaits,
         "ppo": policies,
-        "ppo_over_seeds": {
-            metric: summary(np.array([policy[metric]["mean"] for policy in policies])) for metric in METRICS
+        "ppo_over_seeds": over_seeds | {"finely_integrated": fine},
+        "median_seed": options.seeds[middle],
+        "seeds_better_than": {
+            label: sum(first.better * estimate > first.better * mark for estimate in estimates)
+            for label, mark in reached.items()
         },
-        "seeds_farther_than": {label: sum(d > limit for d in distances) for label, limit in reached.items()},
+        "cpu_s_to_pass": {
+            label: seconds_to_pass(curves, first.name, mark, first.better) for label, mark in reached.items()
+        },
     }
 
 
 def _judged(
     controller: Controller, env_id: str, config: TaskConfig, path: Path, result: Mapping[str, Any]
-) -> tuple[Rollout, dict[str, Any]]:
-    """Recorded episodes, and the numbers of a controller next to how it came about."""
+) -> tuple[Rollout, dict[str, Any], dict[str, Any]]:
+    """Recorded episodes, the numbers of a controller next to how it came about, and those of each episode."""
+    envs = make_envs(env_id, 1, **config.evaluation.env_kwargs)
+    first = headline(envs.task)
+    substeps = config.evaluation.fine_substeps * envs.substeps
     episodes, numbers = evaluate(controller, env_id, config.evaluation)
-    _, fine = evaluate(controller, env_id, config.evaluation, substeps=config.evaluation.fine_substeps)
-    report = {metric: summary(values) for metric, values in numbers.items()}
-    report["distance_m_finely_integrated"] = summary(fine["distance_m"])
-    return episodes, {**report, **result, "file": path.relative_to(path.parents[1]).as_posix()}
+    _, fine = evaluate(controller, env_id, config.evaluation, substeps=substeps)
+    scores = {**numbers, "finely_integrated": fine[first.name]}
+    report: dict[str, Any] = {
+        **{metric.name: summary(scores[metric.name], metric.statistic) for metric in metrics_of(envs.task)},
+        "finely_integrated": summary(scores["finely_integrated"], first.statistic),
+        **result,
+        "file": path.relative_to(path.parents[1]).as_posix(),
+    }
+    return episodes, report, scores
 
 
 def main(options: Compare) -> None:

@@ -124,7 +124,8 @@ class EvaluationConfig:
     Attributes:
         env_kwargs: arguments of the environment in which it is judged, as plain data.
         episodes: episodes, the same starts for every controller.
-        fine_substeps: steps of the integrator in a hold for a second opinion, so that none wins on its error.
+        fine_substeps: steps of the integrator for each that it takes by itself, in a second opinion: none shall win on
+            its error.
     """
 
     env_kwargs: dict[str, Any] = field(default_factory=dict)

@@ -1,6 +1,7 @@
 """Run a controller, gait or policy, in one and the same way, and measure what it did.
 
 python -m training.evaluate runs/compare/SnakeboardForward-v0/ppo-seed0-0123456789ab.zip
+python -m training.evaluate runs/policies/SnakeboardForward-v0.safetensors
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from mechanics.expressions import evaluate as value_of
-from mechanics.mechanism import Mechanism
 from nhenv.vector_env import LocomotionVectorEnv
+from training import policies
 from training.config import EVALUATION_SEEDS, EvaluationConfig, check_env_id
+from training.metrics import joint_index, measure, metrics_of
+from training.statistics import summary
 from training.store import read_json
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
 __all__ = [
-    "METRICS",
     "Controller",
     "PolicyController",
     "Rollout",
@@ -36,14 +37,12 @@ __all__ = [
     "load_policy",
     "make_envs",
     "measure",
+    "origin",
+    "recorded",
     "rollout",
-    "summary",
 ]
 
 Array = NDArray[np.float64]
-
-METRICS = ("distance_m", "energy_j", "cost_of_transport", "return")
-GRAVITY = 9.81  # m/s²; only the cost of transport uses it
 
 
 class Controller(Protocol):
@@ -78,11 +77,19 @@ class Rollout:
         returns: sums of rewards, shape (N,).
         q: coordinates before each step and after the last, shape (N, T + 1, n); after an episode's end its last ones.
         torques: torques that were held, in N m, shape (N, T, m); zero after an episode's end.
+        v: pseudo-velocities in the frame of the environments, as q, shape (N, T + 1, k).
+        steps: steps of each episode, shape (N,).
+        targets: the task's targets by name, shape (N,).
+        final: info of the last step of each episode by name, shape (N,); empty if the environments don't tell.
     """
 
     returns: Array
     q: Array
     torques: Array
+    v: Array
+    steps: NDArray[np.int64]
+    targets: dict[str, Array]
+    final: dict[str, Array]
 
 
 def make_envs(env_id: str, count: int, **options: Any) -> LocomotionVectorEnv:
@@ -92,6 +99,11 @@ def make_envs(env_id: str, count: int, **options: Any) -> LocomotionVectorEnv:
     return envs
 
 
+def recorded(env_id: str, count: int, **options: Any) -> LocomotionVectorEnv:
+    """Environments to run in lockstep that tell all that is measured."""
+    return make_envs(env_id, count, whole_state=True, info="final", **options)
+
+
 def rollout(controller: Controller, envs: LocomotionVectorEnv, seeds: Sequence[int], *, record: bool = True) -> Rollout:
     """Run one episode in each environment, to the last bit as it would run alone.
 
@@ -99,18 +111,20 @@ def rollout(controller: Controller, envs: LocomotionVectorEnv, seeds: Sequence[i
         controller: what drives them.
         envs: N environments, whose episodes are reset by the step after the last.
         seeds: N seeds of their resets.
-        record: whether to keep q and torques, which needs environments made with `whole_state=True`. Without them
+        record: whether to keep q, v and torques, which needs environments made with `whole_state=True`. Without them
             (T = 0) it is faster.
     """
     controller.reset(envs.num_envs)
     observations, _ = envs.reset(seed=list(seeds))
-    q = [envs.q]
+    q, v, targets = [envs.q], [envs.v], envs.targets
     if record and np.isnan(q[0]).any():
         raise ValueError(
             "these environments do not follow every coordinate: make them with whole_state=True, or give record=False"
         )
     returns = np.zeros(envs.num_envs)
     torques = [np.empty((envs.num_envs, 0, len(envs.mechanism.controls)))]
+    final: dict[str, Array] = {}
+    steps = np.zeros(envs.num_envs, np.int64)
     running = np.ones(envs.num_envs, bool)  # the others are in another episode, which does not count
     while running.any():
         actions = controller(observations)
@@ -118,66 +132,60 @@ def rollout(controller: Controller, envs: LocomotionVectorEnv, seeds: Sequence[i
         if infos:
             _raise_failure(infos, running, seeds, actions)
         returns[running] += rewards[running]
+        steps += running
         if record:
             q.append(np.where(running[:, None], envs.q, q[-1]))
+            v.append(np.where(running[:, None], envs.v, v[-1]))
             held = np.clip(actions, -1, 1) * envs.torque_limits
             torques.append(np.where(running[:, None], held, 0.0)[:, None])
-        running &= ~(terminated | truncated)
-    return Rollout(returns, np.stack(q, axis=1), np.concatenate(torques, axis=1))
-
-
-def joint_index(mechanism: Mechanism) -> NDArray[np.intp]:
-    """Coordinate that each control turns, shape (m,); ValueError if a control is not the torque on one joint."""
-    for name, row in mechanism.forces.items():
-        if sorted(row) != ["0"] * (mechanism.n - 1) + ["1"]:
-            raise ValueError(f"{mechanism.name}: {name} is not the torque on one joint, it is the covector {row}")
-    return np.array([row.index("1") for row in mechanism.forces.values()])
-
-
-def measure(envs: LocomotionVectorEnv, episodes: Rollout) -> dict[str, Array]:
-    """Numbers (N,) of each episode, recorded in environments like these.
-
-    distance_m is along the mechanism's forward direction; energy_j is ∫ Σ_a |u_a q̇_a| dt, so that no
-    motor gives energy back (exact over a hold, unless the joint turns round in it); cost_of_transport is
-    the energy over weight times distance.
-    """
-    mechanism, params = envs.mechanism, envs.params
-    forward = np.sign(value_of(mechanism.forward, params))
-    x = mechanism.coordinates.index(mechanism.fibre[0])
-    distance = forward * (episodes.q[:, -1, x] - episodes.q[:, 0, x])
-    turned = np.diff(episodes.q[:, :, joint_index(mechanism)], axis=1)
-    energy = np.abs(episodes.torques * turned).sum(axis=(1, 2))
-    at_origin = params | dict.fromkeys(mechanism.coordinates, 0.0)
-    weight = GRAVITY * mechanism.numeric(mechanism.inertia, at_origin)[x, x]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cost = energy / (weight * distance)
-    return dict(zip(METRICS, (distance, energy, cost, episodes.returns), strict=True))
+        ended = running & (terminated | truncated)
+        for name in envs.task.info:
+            if f"_{name}" in infos:
+                final[name] = np.where(ended & infos[f"_{name}"], infos[name], final.get(name, np.nan))
+        running &= ~ended
+    stacked = np.stack(q, axis=1), np.concatenate(torques, axis=1), np.stack(v, axis=1)
+    return Rollout(returns, *stacked, steps, targets, final)
 
 
 def evaluate(
-    controller: Controller, env_id: str, config: EvaluationConfig, **options: Any
+    controller: Controller, env_id: str, config: EvaluationConfig, *, seeds: int = EVALUATION_SEEDS, **options: Any
 ) -> tuple[Rollout, dict[str, Array]]:
-    """Episodes of a controller from the starts that are kept for judging, and the numbers of each."""
-    envs = make_envs(env_id, config.episodes, whole_state=True, **{**config.env_kwargs, **options})
-    episodes = rollout(controller, envs, range(EVALUATION_SEEDS, EVALUATION_SEEDS + config.episodes))
+    """Episodes of a controller from the starts that are kept for judging, and the numbers of each.
+
+    Args:
+        controller: what drives.
+        env_id: environment.
+        config: how many episodes, and in which environment.
+        seeds: seed of the first episode, if not of those for judging.
+        **options: arguments of the environment, besides those of `config` or instead.
+    """
+    envs = recorded(env_id, config.episodes, **{**config.env_kwargs, **options})
+    episodes = rollout(controller, envs, range(seeds, seeds + config.episodes))
     return episodes, measure(envs, episodes)
 
 
-def summary(values: Array) -> dict[str, float]:
-    """Mean, standard deviation and extremes."""
-    return {
-        "mean": float(np.mean(values)),
-        "std": float(np.std(values)),
-        "min": float(np.min(values)),
-        "max": float(np.max(values)),
-    }
+def load_policy(path: Path) -> Controller:
+    """Policy of a file: as plain data (.safetensors), or of Stable-Baselines3 (.zip).
 
-
-def load_policy(path: Path) -> PolicyController:
-    """Policy of a zip file of Stable-Baselines3. Loading unpickles: only load what you trust."""
+    Loading a zip file unpickles: only load what you trust.
+    """
+    if path.suffix == policies.SUFFIX:
+        return policies.load(path)
     from stable_baselines3 import PPO
 
     return PolicyController(PPO.load(path, device="cpu"))
+
+
+def origin(path: Path) -> tuple[str | None, dict[str, Any]]:
+    """Environment in which a policy learned, and its arguments, as written beside it; None and none if nothing is."""
+    if path.suffix == policies.SUFFIX:
+        card = policies.load(path).card
+        return card["env_id"], card["env_kwargs"]
+    beside = path.with_suffix(".json")
+    if not beside.is_file():
+        return None, {}
+    settings = read_json(beside)["settings"]
+    return settings["env_id"], settings.get("ppo", {}).get("env_kwargs", {})
 
 
 def _raise_failure(
@@ -197,10 +205,11 @@ def _raise_failure(
 class Evaluate:
     """Judge a trained policy.
 
-    Loading a policy unpickles it, which can run any code: only load files that you trust.
+    Loading a zip file unpickles it, which can run any code: only load files that you trust. A .safetensors file, with
+    its card beside it, holds numbers only.
 
     Attributes:
-        policy: zip file written by `training.train`.
+        policy: zip file written by `training.train`, or file written by `training.export`.
         env_id: environment; None for the one in the JSON file beside the policy.
         episodes: number of episodes.
         substeps: steps of the integrator in a hold; None for the environment's default.
@@ -220,17 +229,16 @@ class Evaluate:
 
     def environment(self) -> str:
         """Id of the environment, as given or as written beside the policy."""
-        if self.env_id is not None:
-            return check_env_id(self.env_id)
-        beside = self.policy.with_suffix(".json")
-        if not beside.is_file():
-            raise ValueError(f"give --env-id: there is no {beside} that names the environment")
-        return check_env_id(str(read_json(beside)["settings"]["env_id"]))
+        env_id = self.env_id or origin(self.policy)[0]
+        if env_id is None:
+            raise ValueError(
+                f"give --env-id: there is no {self.policy.with_suffix('.json')} that names the environment"
+            )
+        return check_env_id(env_id)
 
     def env_kwargs(self) -> dict[str, Any]:
         """Arguments of the environment: those it learned with if they are written beside the policy, and `drag`."""
-        beside = self.policy.with_suffix(".json")
-        learned = read_json(beside)["settings"].get("ppo", {}).get("env_kwargs", {}) if beside.is_file() else {}
+        learned = origin(self.policy)[1]
         return learned if self.drag is None else {**learned, "drag": self.drag}
 
 
@@ -238,13 +246,18 @@ def main(options: Evaluate) -> None:
     """Print a table of what the policy does."""
     config = EvaluationConfig(episodes=options.episodes, env_kwargs=options.env_kwargs())
     env_id = options.environment()
-    _, numbers = evaluate(load_policy(options.policy), env_id, config, substeps=options.substeps)
+    envs, controller = make_envs(env_id, 1, **config.env_kwargs), load_policy(options.policy)
+    if isinstance(controller, policies.Policy):
+        controller.require(envs.observation_labels)
+    _, numbers = evaluate(controller, env_id, config, substeps=options.substeps)
     made_with = "".join(f", {name}={value}" for name, value in config.env_kwargs.items())
     table = Table(title=f"{env_id}{made_with}: {options.episodes} episodes")
-    for heading in ("", "mean", "std", "min", "max"):
+    for heading in ("", "estimate", "95 % interval", "mean", "std", "min", "max"):
         table.add_column(heading, justify="right")
-    for name, values in numbers.items():
-        table.add_row(name, *(f"{value:.4g}" for value in summary(values).values()))
+    for metric in metrics_of(envs.task):
+        one = summary(numbers[metric.name], metric.statistic)
+        low, high, *others = (f"{one[key]:.4g}" for key in ("low", "high", "mean", "std", "min", "max"))
+        table.add_row(f"{metric.name}, {metric.statistic}", f"{one['estimate']:.4g}", f"{low} to {high}", *others)
     Console().print(table)
 
 

@@ -13,17 +13,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nhenv.vector_env import LocomotionVectorEnv
-from training.evaluate import Rollout, joint_index
+from training.evaluate import Rollout
+from training.metrics import headline, joint_index
 from training.store import write_bytes
 
-__all__ = ["Shown", "draw"]
+__all__ = ["GAITS", "POLICY", "Shown", "draw", "median_and_range"]
 
 # Okabe and Ito's colours, which the colour-blind tell apart; line styles repeat what colours say.
-GAITS, POLICY = ("#0072B2", "#56B4E9"), "#D55E00"
+GAITS, POLICY = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#CC79A7", "#000000"), "#D55E00"
 JOINTS = ("#000000", "#009E73", "#CC79A7", "#E69F00")
 STYLES = ("-", "--", "-.", ":")
 GREEK = ("theta", "psi", "phi")
 WINDOW = 4.0  # s, the last ones of the episode
+IN_A_ROW = 4  # entries of a legend
+
+# What learning curves are drawn against: key of their points, label, and how many there are of the unit of the label.
+AGAINST = (("steps", "environment steps (millions)", 1e6), ("cpu_s", "CPU time of a seed (s)", 1.0))
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ def draw(
     title: str,
     envs: LocomotionVectorEnv,
     shown: Sequence[Shown],
-    curves: Mapping[str, Sequence[Mapping[str, Any]]],
+    curves: Sequence[Sequence[Mapping[str, Any]]],
     reached: Mapping[str, float],
 ) -> None:
     """Write the figure as PNG, legible at 900 pixels.
@@ -56,18 +61,23 @@ def draw(
         title: heading.
         envs: environments of the episodes.
         shown: controllers; the joints of the first and the last are drawn side by side.
-        curves: label -> learning curve of a seed.
-        reached: gait -> its distance in m.
+        curves: learning curve of each seed.
+        reached: gait -> its value of the metric by which the task is judged.
     """
-    height = _height_of_paths(envs, shown)
-    figure = Figure(figsize=(9, 7.7 + height), dpi=150, layout="constrained")
+    height, lines = _height_of_paths(envs, shown), 0.25 * -(-(len(reached) + 1) // IN_A_ROW)
+    figure = Figure(figsize=(9, 7.7 + height + lines), dpi=150, layout="constrained")
     figure.suptitle(title, fontweight="bold")
     axes = figure.subplot_mosaic(
-        [["path", "path"], ["curve", "curve"], ["angle0", "angle1"], ["torque0", "torque1"]],
-        height_ratios=[height, 2.3, 1.8, 1.8],
+        [["path", "path"], ["legend", "legend"], ["curve0", "curve1"], ["angle0", "angle1"], ["torque0", "torque1"]],
+        height_ratios=[height, lines, 2.3, 1.8, 1.8],
     )
     _paths(axes["path"], envs, shown)
-    _curves(axes["curve"], curves, reached)
+    for i, against in enumerate(AGAINST):
+        _curves(axes[f"curve{i}"], envs, curves, reached, *against)
+    axes["curve1"].sharey(axes["curve0"])
+    axes["legend"].axis("off")
+    entries = axes["curve0"].get_legend_handles_labels()
+    axes["legend"].legend(*entries, loc="center", ncols=min(len(entries[1]), IN_A_ROW), frameon=False)
     for i, one in enumerate((shown[0], shown[-1])):
         _angles(axes[f"angle{i}"], envs, one)
         _torques(axes[f"torque{i}"], envs, one)
@@ -99,18 +109,45 @@ def _paths(ax: Axes, envs: LocomotionVectorEnv, shown: Sequence[Shown]) -> None:
         ax.plot(*q[-1, [x, y]], "o", color=one.color, ms=5)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x (m)", ylabel="y (m)")
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=len(shown), frameon=False)
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=min(len(shown), IN_A_ROW), frameon=False)
 
 
-def _curves(ax: Axes, curves: Mapping[str, Sequence[Mapping[str, Any]]], reached: Mapping[str, float]) -> None:
-    for (label, distance), color in zip(reached.items(), GAITS, strict=False):
-        ax.axhline(distance, color=color, lw=2, label=label)
-    for i, (label, curve) in enumerate(curves.items()):
-        steps = [point["steps"] / 1e6 for point in curve]
-        distances = [point["distance_m"] for point in curve]
-        ax.plot(steps, distances, color=POLICY, ls=STYLES[i % len(STYLES)], lw=1.3, label=label)
-    ax.set(xlabel="environment steps (millions)", ylabel="distance in an episode (m)", title="learning curves")
-    ax.legend(loc="lower right", frameon=False)
+def median_and_range(
+    curves: Sequence[Sequence[Mapping[str, Any]]], key: str, metric: str, count: int = 200
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where all seeds have a curve: places (count,), and there the median, the lowest and the highest of the seeds.
+
+    Args:
+        curves: learning curve of each seed.
+        key: what the curves are drawn against.
+        metric: what is drawn; linear between the points of a curve.
+        count: number of places.
+    """
+    where = [[point[key] for point in curve] for curve in curves]
+    places = np.linspace(max(one[0] for one in where), min(one[-1] for one in where), count)
+    values = [[point[metric] for point in curve] for curve in curves]
+    seeds = np.array([np.interp(places, *one) for one in zip(where, values, strict=True)])
+    return places, np.median(seeds, axis=0), seeds.min(axis=0), seeds.max(axis=0)
+
+
+def _curves(
+    ax: Axes,
+    envs: LocomotionVectorEnv,
+    curves: Sequence[Sequence[Mapping[str, Any]]],
+    reached: Mapping[str, float],
+    key: str,
+    label: str,
+    unit: float,
+) -> None:
+    metric = headline(envs.task)
+    for i, (gait, value) in enumerate(reached.items()):
+        color, style = GAITS[i % len(GAITS)], STYLES[i % len(STYLES)]
+        ax.axhline(value, color=color, ls=style, lw=2, label=gait)
+    places, median, low, high = median_and_range(curves, key, metric.name)
+    several = f"median and range of {len(curves)} seeds" if len(curves) > 1 else "one seed"
+    ax.fill_between(places / unit, low, high, color=POLICY, alpha=0.25, lw=0)
+    ax.plot(places / unit, median, color=POLICY, lw=1.6, label=f"PPO, {several}")
+    ax.set(xlabel=label, ylabel=metric.heading)
 
 
 def _angles(ax: Axes, envs: LocomotionVectorEnv, one: Shown) -> None:

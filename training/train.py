@@ -9,32 +9,36 @@ the outcome is the same to the last bit as without the interruption.
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import io
 import math
 import pickle
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import tyro
+from gymnasium.error import DependencyNotInstalled
 from rich.console import Console
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
 from nhenv.sb3 import make_sb3_vec_env
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed, within
-from training.evaluate import PolicyController, make_envs, measure, rollout
+from training.evaluate import PolicyController, measure, recorded, rollout
+from training.metrics import headline
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
 from training.wrappers import MovingStarts, ScaledReward
 
-__all__ = ["ppo_path", "ppo_settings", "train_piece"]
+__all__ = ["arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
 _CODE = source_digest(__file__)
 
@@ -57,7 +61,7 @@ class Run(BaseCallback):
     There, the model, the environments and the random generators are all that there is to remember.
 
     Attributes:
-        curve: points {"steps", "cpu_s", "return", "distance_m"} of the deterministic policy.
+        curve: points {"steps", "cpu_s", METRIC: mean} of the deterministic policy, with every metric of the task.
         best: the policy's parameters at the point with the largest return, and that point's steps. Gaits are chosen on
             the same starts; nobody is judged on them.
     """
@@ -67,7 +71,8 @@ class Run(BaseCallback):
         self.config, self.checkpoint, self.report = config, checkpoint, report
         self.curve: list[dict[str, float]] = []
         self.best: dict[str, Any] = {"steps": 0, "return": -math.inf, "parameters": {}}
-        self._envs = make_envs(env_id, config.curve_episodes, whole_state=True, **config.env_kwargs)
+        self._envs = recorded(env_id, config.curve_episodes, **config.env_kwargs)
+        self._headline = headline(self._envs.task)
         self._before = {"wall_s": 0.0, "cpu_s": 0.0}  # spent before an interruption
         self._began = _clocks()
 
@@ -85,7 +90,8 @@ class Run(BaseCallback):
         if updates % self.config.curve_every == 0 and not (self.curve and self.curve[-1]["steps"] == steps):
             self.draw()
         try:
-            self.report(steps, self.config.timesteps, f"{self.curve[-1]['distance_m']:.1f} m")
+            text = f"{self.curve[-1][self._headline.name]:.{self._headline.digits}f}"
+            self.report(steps, self.config.timesteps, text)
         except Interrupted:
             self.save()
             raise
@@ -98,10 +104,13 @@ class Run(BaseCallback):
         seeds = range(TUNING_SEEDS, TUNING_SEEDS + self._envs.num_envs)
         numbers = measure(self._envs, rollout(PolicyController(self.model), self._envs, seeds))
         point = {"steps": self.model.num_timesteps, "cpu_s": self.spent["cpu_s"]}
-        self.curve.append(point | {name: float(numbers[name].mean()) for name in ("return", "distance_m")})
-        if self.curve[-1]["return"] > self.best["return"]:
+        means = {name: float(values.mean()) for name, values in numbers.items()}
+        self.curve.append(point | means)
+        for name, mean in means.items():
+            self.logger.record(f"curve/{name}", mean)
+        if means["return"] > self.best["return"]:
             parameters = {name: value.clone() for name, value in self.model.policy.state_dict().items()}
-            self.best = {name: self.curve[-1][name] for name in ("steps", "return")} | {"parameters": parameters}
+            self.best = {"steps": self.model.num_timesteps, "return": means["return"], "parameters": parameters}
 
     def save(self) -> None:
         """Write everything that the rest of the run depends on."""
@@ -138,31 +147,35 @@ def make_envs_to_learn_in(env_id: str, config: PPOConfig, seed: int) -> VecEnv:
     return ScaledReward(envs, config.reward_scale)
 
 
-def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
-    """An untrained model."""
-    return PPO(
-        "MlpPolicy",
-        make_envs_to_learn_in(env_id, config, seed),
-        learning_rate=Linear(*config.learning_rate),
-        n_steps=config.n_steps,
-        batch_size=config.batch_size,
-        n_epochs=config.n_epochs,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
-        clip_range=config.clip_range,
-        target_kl=config.target_kl,
-        ent_coef=config.entropy,
-        policy_kwargs={
+def arguments(config: PPOConfig) -> dict[str, Any]:
+    """Arguments of Stable-Baselines3's PPO that these settings are."""
+    return {
+        "learning_rate": Linear(*config.learning_rate),
+        "n_steps": config.n_steps,
+        "batch_size": config.batch_size,
+        "n_epochs": config.n_epochs,
+        "gamma": config.gamma,
+        "gae_lambda": config.gae_lambda,
+        "clip_range": config.clip_range,
+        "target_kl": config.target_kl,
+        "ent_coef": config.entropy,
+        "policy_kwargs": {
             "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
             "activation_fn": torch.nn.Tanh,
             "log_std_init": config.log_std,
         },
-        seed=training_seed(seed),
-        device="cpu",
-    )
+    }
 
 
-def train_piece(env_id: str, config: PPOConfig, seed: int, out: Path, report: Report = ignore) -> None:
+def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
+    """An untrained model."""
+    envs = make_envs_to_learn_in(env_id, config, seed)
+    return PPO("MlpPolicy", envs, seed=training_seed(seed), device="cpu", **arguments(config))
+
+
+def train_piece(
+    env_id: str, config: PPOConfig, seed: int, out: Path, report: Report = ignore, tensorboard: Path | None = None
+) -> None:
     """Train and write the policy (.zip) and its history (.json), unless that is done; go on from a checkpoint.
 
     Args:
@@ -171,6 +184,7 @@ def train_piece(env_id: str, config: PPOConfig, seed: int, out: Path, report: Re
         seed: number of the run.
         out: folder of the results.
         report: hears of every update.
+        tensorboard: folder in which TensorBoard finds a folder of this run; None for none.
     """
     torch.set_num_threads(1)
     path = ppo_path(env_id, config, seed, out)
@@ -178,10 +192,12 @@ def train_piece(env_id: str, config: PPOConfig, seed: int, out: Path, report: Re
         return
     run = Run(env_id, config, path.with_suffix(".checkpoint"), report)
     model = run.load() if run.checkpoint.exists() else make_model(env_id, config, seed)
-    model.set_logger(Logger(None, []))  # else each run leaves a folder in the system's temporary one
+    model.set_logger(_logger(tensorboard and tensorboard / path.parent.name / path.stem))
     model.learn(config.timesteps - model.num_timesteps, callback=run, reset_num_timesteps=False)
     run.draw()
     model.policy.load_state_dict(run.best["parameters"])
+    model.logger.dump(model.num_timesteps)
+    model.logger.close()
     policy = io.BytesIO()
     model.save(policy)
     write_bytes(path.with_suffix(".zip"), policy.getvalue())
@@ -189,6 +205,18 @@ def train_piece(env_id: str, config: PPOConfig, seed: int, out: Path, report: Re
     result = {"curve": run.curve, **steps, **run.spent, "versions": versions()}
     write_json(path, {"settings": ppo_settings(env_id, config, seed), "result": result})
     run.checkpoint.unlink(missing_ok=True)
+
+
+def check_tensorboard(folder: Path | None) -> None:
+    """Raise DependencyNotInstalled if TensorBoard's files are asked for and there is nothing to write them."""
+    if folder is not None and importlib.util.find_spec("tensorboard") is None:
+        raise DependencyNotInstalled('--tensorboard needs TensorBoard: run pip install "nhenv[tensorboard]"')
+
+
+def _logger(folder: Path | None) -> Logger:
+    """Stable-Baselines3's logger to TensorBoard, or to nowhere: its own default leaves folders in the temporary one."""
+    writers: list[KVWriter] = [] if folder is None else [TensorBoardOutputFormat(str(folder))]
+    return Logger(None if folder is None else str(folder), writers)
 
 
 def ppo_settings(env_id: str, config: PPOConfig, seed: int) -> dict[str, Any]:
@@ -215,6 +243,7 @@ class Train:
         timesteps: environment steps; None for the settings of the task.
         drag: let the mechanism's drag act.
         out: folder of the results.
+        tensorboard: folder of TensorBoard's files; None for none.
     """
 
     env_id: str
@@ -222,10 +251,12 @@ class Train:
     timesteps: int | None = None
     drag: bool = False
     out: Path = Path("runs/train")
+    tensorboard: Path | None = None
 
     def __post_init__(self) -> None:
         check_env_id(self.env_id)
         training_seed(self.seed)
+        check_tensorboard(self.tensorboard)
 
 
 def main(options: Train) -> None:
@@ -234,7 +265,8 @@ def main(options: Train) -> None:
     if options.timesteps is not None:
         config = dataclasses.replace(config, timesteps=options.timesteps)
     path = ppo_path(options.env_id, config, options.seed, options.out).with_suffix(".zip")
-    job = Job(f"{options.env_id} seed {options.seed}", train_piece, (options.env_id, config, options.seed, options.out))
+    train = partial(train_piece, tensorboard=options.tensorboard)
+    job = Job(f"{options.env_id} seed {options.seed}", train, (options.env_id, config, options.seed, options.out))
     console = Console()
     try:
         run_jobs([job], 1, console)

@@ -1,4 +1,5 @@
 import dataclasses
+import importlib.machinery
 import io
 import json
 import os
@@ -6,15 +7,23 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tyro
 from rich.console import Console
+from scipy.stats import trim_mean
 
+import training.evaluate
 from training import config
-from training.compare import Compare, compare
-from training.config import EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
+from training.compare import Compare, compare, judge, strongest_known
+from training.config import EVALUATION_SEEDS, EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
+from training.evaluate import load_policy, make_envs, measure, recorded, rollout
+from training.plots import median_and_range
 from training.progress import Job, run_jobs
+from training.report import markdown
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = TaskConfig(
@@ -50,20 +59,101 @@ def test_it_writes_numbers_a_table_and_a_figure(finished):
     assert written["versions"].keys() >= {"python", "torch", "stable_baselines3", "gymnasium"}
     assert os.uname().nodename not in json.dumps(written["machine"]).split('"')
     one = written["environments"][SNAKEBOARD]
+    described = {"estimate", "low", "high", "mean", "std", "min", "max"}
     for controller in (one["gaits"]["sinusoid"], *one["ppo"], one["ppo_over_seeds"]):
-        for metric in ("distance_m", "energy_j", "cost_of_transport", "return"):
-            assert controller[metric].keys() == {"mean", "std", "min", "max"}
+        for metric in ("distance_m", "energy_j", "cost_of_transport", "return", "finely_integrated"):
+            assert controller[metric].keys() == described
     assert one["gaits"]["sinusoid"]["episodes"] == 14
     assert one["ppo"][0]["steps"] == 512
     assert one["ppo"][0]["distance_m"]["mean"] == results["environments"][SNAKEBOARD]["ppo"][0]["distance_m"]["mean"]
     assert one["config"]["ppo"]["timesteps"] == 512
     table = (options.out / "results.md").read_text(encoding="utf-8")
+    gait = one["gaits"]["sinusoid"]["distance_m"]
     for text in (table, printed):
-        assert f"{one['gaits']['sinusoid']['distance_m']['mean']:.2f} ± " in text
+        assert f"{gait['estimate']:.2f} [{gait['low']:.2f}, {gait['high']:.2f}]" in text
         assert "PPO, seed 0" in text
+    assert "2000 resamples" in table
     image = (options.out / "SnakeboardForward-v0.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert int.from_bytes(image[16:20], "big") >= 900  # its width
+
+
+def test_results_over_seeds_are_those_of_all_their_episodes(finished):
+    _, results, _ = finished
+    one = results["environments"][SNAKEBOARD]
+    values = []
+    for policy in one["ppo"]:
+        (path,) = finished[0].out.rglob(f"ppo-seed{policy['seed']}-*.zip")
+        envs = recorded(SNAKEBOARD, 2)
+        values.append(measure(envs, rollout(load_policy(path), envs, [EVALUATION_SEEDS, EVALUATION_SEEDS + 1])))
+    pooled = np.concatenate([numbers["distance_m"] for numbers in values])
+    assert one["ppo_over_seeds"]["distance_m"]["estimate"] == pytest.approx(trim_mean(pooled, 0.25), rel=1e-12)
+    assert one["ppo_over_seeds"]["distance_m"]["max"] == pytest.approx(pooled.max(), rel=1e-12)
+    limit = one["gaits"]["sinusoid"]["distance_m"]["estimate"]
+    better = [policy["distance_m"]["estimate"] > limit for policy in one["ppo"]]
+    assert one["seeds_better_than"] == {"sinusoid": sum(better)}
+
+
+def test_every_controller_is_judged_again_at_a_tenth_of_the_step(finished):
+    options, *_ = finished
+    asked = []
+
+    def evaluate(controller, env_id, config, **kwargs):
+        asked.append(kwargs)
+        return training.evaluate.evaluate(controller, env_id, config, **kwargs)
+
+    for env_id, own in ((SNAKEBOARD, 1), ("nhenv/RollerRacerForward-v0", 2)):
+        assert make_envs(env_id, 1).substeps == own
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("training.compare.evaluate", evaluate)
+        judge(SNAKEBOARD, options)
+    assert asked == [{}, {"substeps": 2}] * 2  # a gait and a policy; TINY asks for half a step
+
+
+def test_shares_of_the_strongest_known_and_times_to_pass_are_shown(finished):
+    _, results, _ = finished
+    one = results["environments"][SNAKEBOARD]
+    assert one["reference"] is None
+    known = dict(one, reference=50.0, cpu_s_to_pass={"sinusoid": 7.26})
+    text = markdown(dict(results, environments={SNAKEBOARD: known}))
+    gait = one["gaits"]["sinusoid"]["distance_m"]["estimate"]
+    (row,) = (line.split(" | ") for line in text.splitlines() if line.startswith("| sinusoid"))
+    heading = next(line.split(" | ") for line in text.splitlines() if "of the strongest known |" in line)
+    assert row[heading.index("of the strongest known")] == f"{100 * gait / 50:.1f} %"
+    assert row[heading.index("PPO passes it after (CPU s)")] == "7.3"
+    unknown = next(line for line in markdown(results).splitlines() if line.startswith("| sinusoid"))
+    assert unknown.split(" | ")[heading.index("of the strongest known")] == "–"
+
+
+def test_the_strongest_known_is_asked_for_the_environment_that_is_judged(monkeypatch):
+    optimal = types.ModuleType("training.optimal")
+    optimal.__spec__ = importlib.machinery.ModuleSpec("training.optimal", None)
+    optimal.reference = lambda env_id, drag: {(SNAKEBOARD, False): 51.0, (SNAKEBOARD, True): 14.85}.get((env_id, drag))
+    monkeypatch.setitem(sys.modules, "training.optimal", optimal)
+    assert strongest_known(SNAKEBOARD, {}) == 51.0
+    assert strongest_known(SNAKEBOARD, {"drag": True}) == 14.85
+    assert strongest_known("nhenv/SnakeboardGoal-v0", {}) is None
+    assert strongest_known(SNAKEBOARD, {"dt": 0.1}) is None
+    assert strongest_known(SNAKEBOARD, {"drag": {"C": 0.5}}) is None
+
+
+def test_curves_are_drawn_as_their_median_and_range():
+    curves = [
+        [{"steps": 0, "m": 0.0}, {"steps": 10, "m": 10.0}, {"steps": 20, "m": 10.0}],
+        [{"steps": 0, "m": 2.0}, {"steps": 16, "m": 2.0}],
+        [{"steps": 2, "m": 4.0}, {"steps": 30, "m": 4.0}],
+    ]
+    places, median, low, high = median_and_range(curves, "steps", "m", 15)
+    np.testing.assert_allclose(places, np.arange(2, 17))
+    np.testing.assert_allclose(low, 2.0)
+    np.testing.assert_allclose(median, np.clip(places, 2, 4))
+    np.testing.assert_allclose(high, np.clip(places, 4, 10))
+
+
+def test_seeds_are_given_as_ranges_and_the_default_is_three(tmp_path):
+    assert tyro.cli(Compare, args=["--seeds", "0-9"]).seeds == tuple(range(10))
+    assert tyro.cli(Compare, args=["--seeds", "4", "6-7"]).seeds == (4, 6, 7)
+    assert tyro.cli(Compare, args=[]).seeds == (0, 1, 2)
 
 
 def test_second_call_only_judges_and_finds_the_same(finished):

@@ -1,15 +1,17 @@
 import dataclasses
 import os
+import re
 
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import DependencyNotInstalled
 
 from training.config import TUNING_SEEDS, PPOConfig
 from training.evaluate import load_policy, make_envs, rollout
 from training.progress import Interrupted, ignore
 from training.store import read_json
-from training.train import Linear, Run, make_model, ppo_path, train_piece
+from training.train import Linear, Run, Train, make_model, ppo_path, train_piece
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = PPOConfig(
@@ -91,6 +93,33 @@ def test_the_best_policy_of_the_curve_is_kept(uninterrupted):
     envs = make_envs(SNAKEBOARD, TINY.curve_episodes, whole_state=True)
     again = rollout(load_policy(path.with_suffix(".zip")), envs, [TUNING_SEEDS])
     assert again.returns.mean() == best["return"]
+
+
+def test_curve_has_every_metric_of_the_task(uninterrupted):
+    for point in read_json(ppo_path(SNAKEBOARD, TINY, 0, uninterrupted))["result"]["curve"]:
+        assert point.keys() == {"steps", "cpu_s", "distance_m", "return", "energy_j", "cost_of_transport"}
+
+
+def test_tensorboard_sees_the_run_and_changes_nothing(tmp_path, uninterrupted):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train_piece(SNAKEBOARD, TINY, 0, tmp_path / "out", tensorboard=tmp_path / "board")
+    np.testing.assert_array_equal(parameters(tmp_path / "out"), parameters(uninterrupted))
+    (file,) = (tmp_path / "board").rglob("events.out.tfevents.*")
+    path = ppo_path(SNAKEBOARD, TINY, 0, tmp_path)
+    assert file.parent == tmp_path / "board" / "SnakeboardForward-v0" / path.stem
+    events = EventAccumulator(str(file.parent)).Reload()
+    assert len(events.Scalars("train/loss")) == TINY.timesteps // 128  # of every update, the last one included
+    drawn = [event.value for event in events.Scalars("curve/distance_m")]
+    np.testing.assert_allclose(drawn, [point["distance_m"] for point in curve(tmp_path / "out")], rtol=1e-6)  # float32
+
+
+def test_missing_tensorboard_is_named_with_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(DependencyNotInstalled, match=re.escape('pip install "nhenv[tensorboard]"')):
+        Train(env_id=SNAKEBOARD, tensorboard=tmp_path)
+    assert Train(env_id=SNAKEBOARD).tensorboard is None
 
 
 def test_settings_reach_the_algorithm():

@@ -1,0 +1,69 @@
+"""Write the settings of PPO as a hyperparameter file of RL Baselines3 Zoo, training/rl_zoo.yml.
+
+python -m training.rl_zoo
+
+The Zoo reads it by
+
+python -m rl_zoo3.train --algo ppo --env nhenv/SnakeboardForward-v0 --gym-packages nhenv \
+    --conf-file training/rl_zoo.yml
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import nhenv
+from training.config import CONFIGS, PPOConfig, task_name
+from training.store import write_bytes
+from training.train import Linear, arguments
+
+__all__ = ["FILE", "text"]
+
+FILE = Path(__file__).with_name("rl_zoo.yml")
+
+HEADER = """\
+# PPO for the environments of nhenv, in the format of RL Baselines3 Zoo. Written by `python -m training.rl_zoo`;
+# do not edit. What the format cannot say: learning rates fall to zero there, here to {last}; here first
+# episodes have random lengths, some begin in motion, rewards are scaled, the best policy of the learning curve is
+# kept, and all environments are stepped by one call.
+"""
+
+
+def entry(config: PPOConfig) -> dict[str, str]:
+    """Settings as the Zoo writes them."""
+    plain = {"n_envs": config.n_envs, "n_timesteps": config.timesteps, "policy": "MlpPolicy", **arguments(config)}
+    return {name: _written(value) for name, value in plain.items()}
+
+
+def text() -> str:
+    """Content of the file: settings by task, and the environments that have it."""
+    last = sorted({config.ppo.learning_rate[1] for config in CONFIGS.values()})
+    lines = [HEADER.format(last=" or ".join(f"{rate:g}" for rate in last))]
+    for task, config in CONFIGS.items():
+        lines += [f"{task}: &{task}", *(f"  {name}: {value}" for name, value in entry(config.ppo).items()), ""]
+    for env_id in sorted(nhenv.environment_ids()):
+        if (task := task_name(env_id)) in CONFIGS:
+            lines += [f"{env_id}:", f"  <<: *{task}"]
+    return "\n".join(lines) + "\n"
+
+
+def _written(value: Any) -> str:
+    """A value in YAML; what is no number stands as Python, which the Zoo evaluates."""
+    match value:
+        case Linear():
+            return f"lin_{value.first!r}"
+        case dict():
+            return f'"{_python(value)}"'
+    return str(value)
+
+
+def _python(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"dict({', '.join(f'{key}={_python(one)}' for key, one in value.items())})"
+    return f"nn.{value.__name__}" if isinstance(value, type) else repr(value)
+
+
+if __name__ == "__main__":
+    write_bytes(FILE, text().encode())
+    print(f"written to {FILE}")
