@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ OVERSAMPLING = 4
 
 def pygame_module() -> Any:
     """The library that draws, with its fonts ready; no display is opened."""
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it would write a line on every program's output
     try:
         import pygame
         import pygame.font
@@ -143,6 +141,6 @@ class Window:
 
 
 def _inside(points: ArrayLike) -> Any:
-    """Points on the finer surface. SDL takes 16 bits: what lies far outside is moved nearer, where nobody sees it."""
+    """Points on the finer surface. What lies far outside is moved nearer, unseen: SDL would walk along all of it."""
     array = np.asarray(points, dtype=float) * OVERSAMPLING
     return np.clip(array, -30_000, 30_000).round().astype(int).tolist()
