@@ -22,7 +22,8 @@ import mechanics
 from benchmarks.peers import actions
 from nhenv.env import LocomotionEnv
 from training.config import GaitConfig
-from training.gaits import Joints, bounds, sinusoid
+from training.gaits import Joints, sinusoids
+from training.tuning import controller
 
 __all__ = ["Errors", "errors"]
 
@@ -85,7 +86,7 @@ def _hold(single: LocomotionEnv, env_id: str, options: Mapping[str, Any], every:
 
 def _run(single: LocomotionEnv, env_id: str, options: Mapping[str, Any], runs: int) -> float:
     try:
-        gait = sinusoid(gym.make(env_id), GaitConfig(), _gaits(single))
+        gait = controller(gym.make(env_id), GaitConfig(), _gaits(single))
     except ValueError:  # not driven by torques on its joints
         return np.nan
     envs = gym.make_vec(env_id, num_envs=CANDIDATES, **options)
@@ -115,7 +116,7 @@ def _distance(found: Array, true: Array) -> float:
 def _gaits(single: LocomotionEnv) -> Array:
     """Random gaits (N, p)."""
     joints = Joints(single)
-    ranges = bounds(joints, GaitConfig())
+    ranges = sinusoids(single, GaitConfig(), RUN_SECONDS).bounds
     low, high = np.asarray(ranges.lb), np.asarray(ranges.ub)
     drawn = np.random.default_rng(0).uniform(low, high, (CANDIDATES, len(low)))
     drawn[:, : len(joints.index)] *= AMPLITUDE

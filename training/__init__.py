@@ -4,7 +4,9 @@ config      every setting of an experiment, frozen
 metrics     what is measured of an episode
 evaluate    the harness: one way to run a controller and to measure it
 statistics  interquartile means with intervals, over seeds and episodes
-gaits       sinusoidal gaits by computed torque, tuned by differential evolution
+gaits       sinusoidal gaits, by computed torque or as torques
+laws        laws in closed form that go farther, a file for each mechanism
+tuning      differential evolution of gaits and laws
 train       PPO with Stable-Baselines3, checkpointed
 sweep       PPO with many settings
 compare     all of it, in parallel, into a table and a figure

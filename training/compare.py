@@ -29,7 +29,6 @@ from rich.console import Console
 from training import config as settings_of
 from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id
 from training.evaluate import Controller, Rollout, evaluate, load_policy, make_envs
-from training.gaits import gait_path, sinusoid, tune_piece
 from training.metrics import headline, metrics_of
 from training.options import Seeds, check_seeds
 from training.plots import GAITS, POLICY, Shown, draw
@@ -38,6 +37,7 @@ from training.report import markdown, tables
 from training.statistics import median_run, seconds_to_pass, summary
 from training.store import machine, read_json, versions, write_bytes, write_json
 from training.train import check_tensorboard, ppo_path, train_piece
+from training.tuning import controller, gait_path, tune_piece
 
 __all__ = ["Compare", "compare", "judge", "strongest_known"]
 
@@ -145,8 +145,8 @@ def judge(env_id: str, options: Compare) -> dict[str, Any]:
     for label, gait in config.gaits.items():
         path = gait_path(env_id, gait, out)
         tuned = read_json(path)["result"]
-        controller = sinusoid(make_envs(env_id, 1, **gait.env_kwargs), gait, tuned["vector"])
-        episodes, gaits[label], _ = _judged(controller, env_id, config, path, tuned)
+        driver = controller(make_envs(env_id, 1, **gait.env_kwargs), gait, tuned["vector"])
+        episodes, gaits[label], _ = _judged(driver, env_id, config, path, tuned)
         shown.append(Shown(label, GAITS[len(shown) % len(GAITS)], episodes))
     for seed in options.seeds:
         path = ppo_path(env_id, config.ppo, seed, out)

@@ -11,6 +11,7 @@ import gymnasium as gym
 import nhenv
 from mechanics.expressions import unknown_name
 from nhenv import tasks
+from nhenv.registration import as_mechanism
 
 __all__ = [
     "COMPARED",
@@ -20,8 +21,11 @@ __all__ = [
     "TUNING_SEEDS",
     "EvaluationConfig",
     "GaitConfig",
+    "LawConfig",
     "PPOConfig",
+    "SearchConfig",
     "TaskConfig",
+    "TorqueConfig",
     "check_env_id",
     "for_env",
     "quick",
@@ -37,17 +41,11 @@ EVALUATION_SEEDS = 20_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaitConfig:
-    """Tuning of a sinusoidal gait by differential evolution.
+class SearchConfig:
+    """Tuning by differential evolution: the budget that every family of gaits and laws has.
 
     Attributes:
         env_kwargs: arguments of the environment in which it is tuned, as plain data, such as {"drag": True}.
-        steered: whether amplitudes and frequency change over the episode, and the heading is fed back.
-        cyclic_ratio: frequency of the joints without stops over that of the joints with stops.
-        frequency: smallest and largest angular frequency of the joints with stops, rad/s.
-        cyclic_amplitude: largest amplitude of a joint without stops, rad. One with stops reaches its stop.
-        steering: largest gain from the sine of the heading to the joints with stops, rad.
-        damping: smallest and largest kd of the feedback, 1/s. A torque held for dt needs kd * dt < 2.
         population: candidates in a generation, rounded down to a multiple of the number of parameters.
         generations: generations after the first, which is a Latin hypercube.
         starts: episodes on which each candidate is tried.
@@ -55,16 +53,96 @@ class GaitConfig:
     """
 
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    steered: bool = False
-    cyclic_ratio: float = 1.0
-    frequency: tuple[float, float] = (1.0, 30.0)
-    cyclic_amplitude: float = 12.0
-    steering: float = 2.0
-    damping: tuple[float, float] = (2.0, 38.0)
     population: int = 64
     generations: int = 100
     starts: int = 4
     seed: int = 0
+
+    @property
+    def label(self) -> str:
+        """What it is called where nothing else tells."""
+        raise NotImplementedError
+
+    def fits(self, mechanism: str) -> bool:
+        """Whether the mechanism of this name can be driven so."""
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaitConfig(SearchConfig):
+    """Sinusoidal gaits by computed torque.
+
+    What is fed back are expressions in what is observed, by label and in SI units, and in `forward` (+1 or -1).
+
+    Attributes:
+        steered: whether amplitudes and frequency change over the episode, and the joints with stops are turned further.
+        steered_by: what turns them in a steered gait, times a tuned gain.
+        steering: largest of these gains, rad.
+        cyclic_by: what scales the amplitudes of the joints without stops, times a tuned gain, from -1 to 1; None to
+            leave them.
+        limited_by: the same for the joints with stops.
+        gain: largest of the gains of these two.
+        cyclic_ratio: frequency of the joints without stops over that of the joints with stops.
+        frequency: smallest and largest angular frequency of the joints with stops, rad/s.
+        cyclic_amplitude: largest amplitude of a joint without stops, rad. One with stops reaches its stop.
+        damping: smallest and largest kd of the feedback, 1/s. A torque held for dt needs kd * dt < 2.
+    """
+
+    steered: bool = False
+    steered_by: str = "sin_heading"
+    steering: float = 2.0
+    cyclic_by: str | None = None
+    limited_by: str | None = None
+    gain: float = 5.0
+    cyclic_ratio: float = 1.0
+    frequency: tuple[float, float] = (1.0, 30.0)
+    cyclic_amplitude: float = 12.0
+    damping: tuple[float, float] = (2.0, 38.0)
+
+    @property
+    def label(self) -> str:
+        """What it is called where nothing else tells."""
+        return "steered sinusoid" if self.steered else "sinusoid"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueConfig(SearchConfig):
+    """Torques that are sinusoids, in open loop.
+
+    Attributes:
+        cyclic_ratio: frequency of the torques on joints without stops over that on joints with stops.
+        frequency: smallest and largest angular frequency of the torques on joints with stops, rad/s.
+    """
+
+    cyclic_ratio: float = 1.0
+    frequency: tuple[float, float] = (1.0, 30.0)
+
+    @property
+    def label(self) -> str:
+        """What it is called where nothing else tells."""
+        return "torque sinusoid"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawConfig(SearchConfig):
+    """A law in closed form, of `training.laws`.
+
+    Attributes:
+        mechanism: name of the mechanism that it is for.
+        law: name of the law.
+    """
+
+    mechanism: str
+    law: str
+
+    @property
+    def label(self) -> str:
+        """What it is called where nothing else tells."""
+        return self.law
+
+    def fits(self, mechanism: str) -> bool:
+        """Whether the mechanism of this name can be driven so."""
+        return mechanism == self.mechanism
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,19 +216,43 @@ class TaskConfig:
     """Settings of every part of an experiment on one task.
 
     Attributes:
-        gaits: by name, with equal budgets. The first is the one that is drawn beside the policy.
+        gaits: by name, with equal budgets; each where it fits the mechanism. The first is drawn beside the policy.
         ppo: what trains the policy.
         evaluation: what judges both.
     """
 
-    gaits: dict[str, GaitConfig] = field(
-        default_factory=lambda: {"sinusoid": GaitConfig(), "steered sinusoid": GaitConfig(steered=True)}
+    gaits: dict[str, SearchConfig] = field(
+        default_factory=lambda: {
+            "sinusoid": GaitConfig(),
+            "steered sinusoid": GaitConfig(steered=True),
+            "torque sinusoid": TorqueConfig(),
+            "bang-bang": LawConfig(mechanism="snakeboard", law="bang-bang"),
+            "charge, then go": LawConfig(mechanism="snakeboard", law="charge, then go"),
+            "chirped steering": LawConfig(mechanism="snakeboard", law="chirped steering"),
+            "relay": LawConfig(mechanism="roller_racer", law="relay"),
+        }
     )
     ppo: PPOConfig = field(default_factory=PPOConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
-CONFIGS: dict[str, TaskConfig] = {"Forward": TaskConfig()}
+CONFIGS: dict[str, TaskConfig] = {
+    "Forward": TaskConfig(),
+    "Velocity": TaskConfig(
+        # The more speed is missing, the larger the swing; a joint that swings the other way brakes.
+        gaits={
+            "sinusoid": GaitConfig(limited_by="commanded_speed - forward*speed"),
+            "steered sinusoid": GaitConfig(steered=True, limited_by="commanded_speed - forward*speed"),
+        }
+    ),
+    "Goal": TaskConfig(
+        gaits={
+            "steered sinusoid": GaitConfig(steered=True, steered_by="atan2(forward*goal_left, forward*goal_ahead)"),
+            # To a goal behind it goes backwards, if the mechanism can.
+            "steered either way": GaitConfig(steered=True, steered_by="goal_left", limited_by="goal_ahead"),
+        }
+    ),
+}
 
 # The environments of the main job: the paper's two mechanisms, whose gaits are known.
 COMPARED = ("nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0")
@@ -185,8 +287,12 @@ def check_env_id(env_id: str) -> str:
 
 
 def for_env(env_id: str) -> TaskConfig:
-    """Settings for the task of this environment."""
-    return CONFIGS[task_name(check_env_id(env_id))]
+    """Settings for the task of this environment, with the gaits that fit its mechanism."""
+    config = CONFIGS[task_name(check_env_id(env_id))]
+    mechanism = as_mechanism(gym.spec(env_id).kwargs["mechanism"]).name
+    return dataclasses.replace(
+        config, gaits={name: gait for name, gait in config.gaits.items() if gait.fits(mechanism)}
+    )
 
 
 def training_seed(run: int) -> int:

@@ -29,10 +29,10 @@ from mechanics.expressions import evaluate as value_of
 from nhenv import render
 from nhenv.canvas import Canvas
 from nhenv.vector_env import LocomotionVectorEnv
-from training.config import EVALUATION_SEEDS, GaitConfig
+from training.config import EVALUATION_SEEDS
 from training.evaluate import Controller, load_policy, rollout
-from training.gaits import sinusoid
 from training.store import read_json, write_bytes
+from training.tuning import controller, search_config
 
 __all__ = ["Actor", "Film", "Take", "actor", "film", "frames", "gif", "mp4", "random_actor", "record"]
 
@@ -117,8 +117,8 @@ _Read = tuple[str, Callable[[LocomotionVectorEnv], Controller]]
 
 
 def _gait(path: Path, settings: Mapping[str, Any], result: Mapping[str, Any]) -> _Read:
-    config = GaitConfig(**settings["gait"])
-    return "steered sinusoid" if config.steered else "sinusoid", lambda envs: sinusoid(envs, config, result["vector"])
+    config = search_config(settings)
+    return config.label, lambda envs: controller(envs, config, result["vector"])
 
 
 def _policy(path: Path, settings: Mapping[str, Any], result: Mapping[str, Any]) -> _Read:

@@ -1,7 +1,8 @@
-"""Sinusoidal gaits: joints that follow a sin(w t + b) by computed torque, tuned by differential evolution.
+"""Sinusoidal gaits: joints that follow a sin(w t + b) by computed torque, or torques that are such sines.
 
 A steered gait also changes a and w over the episode and leans against the heading, because a fixed
-sinusoid is the weak member of its family.
+sinusoid is the weak member of its family. For tasks with a target, what is observed of it scales the
+amplitudes and turns the joints with stops: an expression says how, and a tuned gain how much.
 
 A gait knows its mechanism through data only: which coordinate each torque turns, whether that joint
 has stops, and the reduced equations. It sees what a policy sees, and a clock.
@@ -9,31 +10,22 @@ has stops, and the reduced equations. It sees what a policy sees, and a clock.
 
 from __future__ import annotations
 
-import dataclasses
-import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import Bounds, differential_evolution
 
-from mechanics.expressions import evaluate
 from mechanics.model import Model
 from nhenv.env import LocomotionEnv
 from nhenv.vector_env import LocomotionVectorEnv
-from training.config import TUNING_SEEDS, GaitConfig
-from training.evaluate import joint_index, make_envs, rollout
-from training.progress import Report, ignore
-from training.store import piece_path, settings, source_digest, versions, write_json
+from training.config import GaitConfig, TorqueConfig
+from training.family import Family
+from training.metrics import joint_index
+from training.observed import Observed, Seen
 
-__all__ = ["Gait", "Joints", "Sinusoid", "Tuned", "bounds", "gait_path", "sinusoid", "tune", "tune_piece"]
+__all__ = ["Feedback", "Gait", "Joints", "Sinusoid", "TorqueSinusoid", "sinusoids", "torque_sinusoids"]
 
 Array = NDArray[np.float64]
-
-_CODE = source_digest(__file__)
 
 
 class Joints:
@@ -44,6 +36,7 @@ class Joints:
 
     Attributes:
         model: the mechanism's equations.
+        observed: reads observations.
         index: coordinate that each control turns, shape (m,).
         stops: largest angles of these joints in rad, inf where there is no stop, shape (m,).
         cyclic: whether a joint is without stops, shape (m,).
@@ -58,14 +51,12 @@ class Joints:
         self.index = joint_index(mechanism)
         self.stops = np.array([mechanism.joint_limits.get(names[i], np.inf) for i in self.index])
         self.cyclic = np.isinf(self.stops)
-        # The label of an observation names a quantity, its expression only scales it.
-        labels = [*mechanism.observation, *env.task.observation]
-        self._sine = labels.index("sin_heading") if "sin_heading" in labels else None
-        self._units = np.array([1 / evaluate(text, {label: 1.0}) for label, text in mechanism.observation.items()])
+        self.observed = Observed(env)
+        labels = self.observed.labels
         self._angles = [(labels.index(name), i) for i, name in enumerate(names) if name in labels]
         rates = [(labels.index(f"{name}_dot"), i) for i, name in enumerate(names) if f"{name}_dot" in labels]
         rates.append((labels.index("speed"), names.index(mechanism.fibre[0])))  # heading 0: speed is ẋ
-        self._observed, self._moving = (list(column) for column in zip(*rates, strict=True))
+        self._rates, self._moving = (list(column) for column in zip(*rates, strict=True))
 
     def state(self, observations: ArrayLike) -> tuple[Array, Array]:
         """Coordinates (..., n) and pseudo-velocities (..., k) behind observations (..., d).
@@ -73,18 +64,19 @@ class Joints:
         Up to symmetry: position, heading and cyclic angles are put to zero.
         """
         n, k = self.model.mechanism.n, self.model.mechanism.rank
-        values = np.asarray(observations, dtype=float)[..., : len(self._units)] * self._units
+        values = self.observed.values(observations)
         q = np.zeros((*values.shape[:-1], n))
         for source, target in self._angles:
             q[..., target] = values[..., source]
         frame = self.model.velocity(q, _stack(np.eye(k), q))  # (k, ..., n): one vector field a row
         matrix = np.moveaxis(frame[..., self._moving], 0, -1)
-        return q, np.linalg.solve(matrix, values[..., self._observed, None])[..., 0]
+        v = np.linalg.solve(matrix, values[..., self._rates, None])[..., 0]
+        return q, v.astype(float, copy=False)
 
-    def heading_sine(self, observations: ArrayLike) -> Array:
-        """Sine of the heading (..., 1); zero if the task does not show it."""
-        values = np.asarray(observations, dtype=float)
-        return np.zeros_like(values[..., :1]) if self._sine is None else values[..., self._sine, None]
+    def rates(self, seen: Seen) -> Array:
+        """Rates of the joints (..., m), rad/s."""
+        names = self.model.mechanism.coordinates
+        return np.stack([seen[f"{names[i]}_dot"] for i in self.index], axis=-1)
 
     def torque(self, q: Array, v: Array, acceleration: Array) -> Array:
         """Torques (..., m) in N m that give the joints these accelerations (..., m) in rad/s²."""
@@ -99,8 +91,7 @@ class Joints:
 class Gait:
     """References a sin(r w t + b) of the joints, and their feedback. Leading axes are for many gaits at once.
 
-    In a steered gait a and the frequency w change linearly, with rates a' and w', and the joints with
-    stops are turned further by g sin(heading).
+    In a scheduled gait a and the frequency w change linearly, with rates a' and w'.
 
     Attributes:
         amplitude: a at the start in rad, shape (..., m).
@@ -109,7 +100,6 @@ class Gait:
         damping: kd in 1/s, shape (..., m); kp is kd²/4, the critically damped value.
         frequency: w at the start in rad/s, shape (..., 1).
         frequency_rate: w' in rad/s², shape (..., 1).
-        steering: g in rad, shape (..., 1).
         ratio: r, shape (m,).
     """
 
@@ -119,23 +109,22 @@ class Gait:
     damping: Array
     frequency: Array
     frequency_rate: Array
-    steering: Array
     ratio: Array
 
     @classmethod
     def from_vector(cls, vector: Array, ratio: Array, duration: float) -> Gait:
-        """Gait of a vector: amplitudes, phases, dampings, w; if steered also the last amplitudes, the last w, and g.
+        """Gait of a vector: amplitudes, phases, dampings, w; if scheduled also the last amplitudes and the last w.
 
         Args:
-            vector: shape (..., 3m + 1), or (..., 4m + 3) if steered.
+            vector: shape (..., 3m + 1), or (..., 4m + 2) if scheduled.
             ratio: shape (m,).
-            duration: time in s after which a steered gait has its last amplitudes and frequency.
+            duration: time in s after which a scheduled gait has its last amplitudes and frequency.
         """
         m = len(ratio)
         amplitude, phase, damping, frequency = np.split(vector[..., : 3 * m + 1], [m, 2 * m, 3 * m], -1)
-        last_amplitude, last_frequency, steering = amplitude, frequency, np.zeros_like(frequency)
+        last_amplitude, last_frequency = amplitude, frequency
         if vector.shape[-1] > 3 * m + 1:
-            last_amplitude, last_frequency, steering = np.split(vector[..., 3 * m + 1 :], [m, m + 1], -1)
+            last_amplitude, last_frequency = np.split(vector[..., 3 * m + 1 :], [m], -1)
         return cls(
             amplitude,
             (last_amplitude - amplitude) / duration,
@@ -143,7 +132,6 @@ class Gait:
             damping,
             frequency,
             (last_frequency - frequency) / duration,
-            steering,
             ratio,
         )
 
@@ -161,134 +149,133 @@ class Gait:
         return self.ratio * (self.frequency * t + self.frequency_rate * t**2 / 2) + self.phase
 
 
+@dataclass(frozen=True)
+class Feedback:
+    """How what is observed changes a gait: expressions, and a gain for each, shape (...).
+
+    Attributes:
+        steering: turns the joints with stops further, by the gain times its value, rad.
+        cyclic: scales the amplitudes of the joints without stops, by the gain times its value, from -1 to 1.
+        limited: scales the amplitudes of the joints with stops in the same way.
+    """
+
+    steering: tuple[str, Array] | None = None
+    cyclic: tuple[str, Array] | None = None
+    limited: tuple[str, Array] | None = None
+
+    def offset(self, seen: Seen) -> Array:
+        """What is added to the angles of the joints with stops, shape (..., 1)."""
+        return np.zeros(1) if self.steering is None else self._value(self.steering, seen)
+
+    def scale(self, seen: Seen, cyclic: NDArray[np.bool_]) -> Array:
+        """What multiplies the amplitudes, shape (..., m)."""
+        free, held = (
+            np.ones(1) if rule is None else np.clip(self._value(rule, seen), -1, 1)
+            for rule in (self.cyclic, self.limited)
+        )
+        return np.where(cyclic, free, held)
+
+    @staticmethod
+    def _value(rule: tuple[str, Array], seen: Seen) -> Array:
+        text, gain = rule
+        return (gain * seen.value(text))[..., None]
+
+
 class Sinusoid:
     """Controller that makes the joints follow a gait: computed torque plus feedback, saturated."""
 
-    def __init__(self, joints: Joints, gait: Gait) -> None:
+    def __init__(self, joints: Joints, gait: Gait, feedback: Feedback | None = None) -> None:
         self.joints, self.gait = joints, gait
+        self.feedback = feedback or Feedback()
         self.steps = 0
 
     def reset(self, episodes: int) -> None:
         """Start the clock; `episodes` must fit the gait's leading axes."""
         self.steps = 0
 
-    def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, observations: NDArray[np.float32], /) -> NDArray[np.float32]:
         """Actions (N, m) for observations (N, d)."""
         joints, gait, t = self.joints, self.gait, self.steps * self.joints.dt
         self.steps += 1
         q, v = joints.state(observations)
+        seen = joints.observed(observations)
+        scale = self.feedback.scale(seen, joints.cyclic)
         rate = gait.rate(t)
-        rate_error = rate - joints.model.velocity(q, v)[..., joints.index]
+        rate_error = scale * rate - joints.rates(seen)
         # A rotor may be anywhere: only its rate is held.
-        wanted = gait.angle(t) + gait.steering * joints.heading_sine(observations)
+        wanted = scale * gait.angle(t) + self.feedback.offset(seen)
         angle_error = np.where(joints.cyclic, 0.0, wanted - q[..., joints.index])
         # The torque is held, so what counts is the acceleration on average over the hold.
-        forward = (gait.rate(t + joints.dt) - rate) / joints.dt
+        forward = scale * (gait.rate(t + joints.dt) - rate) / joints.dt
         acceleration = forward + gait.damping * rate_error + gait.damping**2 / 4 * angle_error
         torque = joints.torque(q, v, acceleration)
         return np.clip(torque / joints.limits, -1, 1).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Tuned:
-    """Outcome of a search.
+class TorqueSinusoid:
+    """Controller that gives torques a sin(r w t + b) in open loop, a in shares of the limits: it looks at nothing."""
 
-    Attributes:
-        vector: the best gait, as `Gait.from_vector` takes it.
-        history: best mean return after each generation, the random first one included.
-        episodes: episodes simulated.
-    """
+    def __init__(self, dt: float, amplitude: Array, phase: Array, frequency: Array) -> None:
+        """Amplitudes (..., m) from 0 to 1, phases (..., m) in rad and angular frequencies r w (..., m) in rad/s."""
+        self.dt, self.amplitude, self.phase, self.frequency = dt, amplitude, phase, frequency
+        self.steps = 0
 
-    vector: list[float]
-    history: list[float]
-    episodes: int
+    def reset(self, episodes: int) -> None:
+        """Start the clock; `episodes` must fit the leading axes."""
+        self.steps = 0
+
+    def __call__(self, observations: NDArray[np.float32], /) -> NDArray[np.float32]:
+        """Actions (N, m), whatever the observations (N, d)."""
+        turned = self.frequency * (self.steps * self.dt) + self.phase
+        self.steps += 1
+        actions = self.amplitude * np.sin(turned)
+        return np.broadcast_to(actions, (len(observations), actions.shape[-1])).astype(np.float32)
 
 
-def bounds(joints: Joints, config: GaitConfig) -> Bounds:
-    """Range of each entry of a gait's vector."""
-    m = len(joints.index)
-    amplitude = [(0.0, largest) for largest in np.where(joints.cyclic, config.cyclic_amplitude, joints.stops).tolist()]
-    ranges = [*amplitude, *[(-np.pi, np.pi)] * m, *[config.damping] * m, config.frequency]
+def sinusoids(env: LocomotionEnv | LocomotionVectorEnv, config: GaitConfig, duration: float) -> Family:
+    """Gaits by computed torque; a steered one has its last amplitudes and frequency after `duration` seconds."""
+    joints = Joints(env)
+    names = [env.mechanism.coordinates[i] for i in joints.index]
+    amplitudes = [(0.0, a) for a in np.where(joints.cyclic, config.cyclic_amplitude, joints.stops).tolist()]
+    ranges = dict(zip([f"{name} amplitude" for name in names], amplitudes, strict=True))
+    ranges |= {f"{name} phase": (-np.pi, np.pi) for name in names}
+    ranges |= {f"{name} damping": config.damping for name in names}
+    ranges["frequency"] = config.frequency
     if config.steered:
-        ranges += [*amplitude, config.frequency, (-config.steering, config.steering)]
-    return Bounds(*np.transpose(ranges))
+        ranges |= dict(zip([f"{name} last amplitude" for name in names], amplitudes, strict=True))
+        ranges["last frequency"] = config.frequency
+    entries = len(ranges)
+    wanted = {"steering": config.steered_by if config.steered else None}
+    wanted |= {"cyclic": config.cyclic_by, "limited": config.limited_by}
+    rules = {name: joints.observed.check(text) for name, text in wanted.items() if text is not None}
+    largest = {"steering": config.steering, "cyclic": config.gain, "limited": config.gain}
+    ranges |= {f"{name} gain": (-largest[name], largest[name]) for name in rules}
+
+    def controller(vector: Array) -> Sinusoid:
+        gait = Gait.from_vector(vector[..., :entries], _ratio(joints, config), duration)
+        gains = np.moveaxis(vector[..., entries:], -1, 0)
+        pairs = zip(rules.values(), gains, strict=True)
+        return Sinusoid(joints, gait, Feedback(**dict(zip(rules, pairs, strict=True))))
+
+    return Family(ranges, controller)
 
 
-def sinusoid(env: gym.Env[Any, Any] | LocomotionVectorEnv, config: GaitConfig, vector: ArrayLike) -> Sinusoid:
-    """Controller for the gait (p,), or for one gait an episode (N, p), made for episodes as long as those of the id."""
-    inner, spec = env.unwrapped, env.spec
-    assert isinstance(inner, LocomotionEnv | LocomotionVectorEnv)
-    assert spec is not None
-    assert spec.max_episode_steps is not None
-    joints = Joints(inner)
-    ratio = np.where(joints.cyclic, config.cyclic_ratio, 1.0)
-    duration = spec.max_episode_steps * joints.dt
-    return Sinusoid(joints, Gait.from_vector(np.asarray(vector, dtype=float), ratio, duration))
+def torque_sinusoids(env: LocomotionEnv | LocomotionVectorEnv, config: TorqueConfig, duration: float) -> Family:
+    """Gaits whose torques are sinusoids; they do not change with time, so `duration` does not matter."""
+    joints, controls = Joints(env), env.mechanism.controls
+    m = len(controls)
+    ranges = {f"{name} amplitude": (0.0, 1.0) for name in controls}
+    ranges |= {f"{name} phase": (-np.pi, np.pi) for name in controls} | {"frequency": config.frequency}
+
+    def controller(vector: Array) -> TorqueSinusoid:
+        amplitude, phase, frequency = np.split(vector, [m, 2 * m], -1)
+        return TorqueSinusoid(joints.dt, amplitude, phase, frequency * _ratio(joints, config))
+
+    return Family(ranges, controller)
 
 
-def tune(env_id: str, config: GaitConfig, report: Report = ignore) -> Tuned:
-    """Search for the gait with the largest mean return: the reward that a policy learns from.
-
-    Args:
-        env_id: environment.
-        config: settings of the search.
-        report: hears of every generation.
-    """
-    ranges = bounds(Joints(make_envs(env_id, 1, **config.env_kwargs)), config)
-    history: list[float] = []
-    episodes = 0
-
-    def loss(candidates: Array) -> Array:
-        """Negative mean returns (S,) of gaits (p, S)."""
-        nonlocal episodes
-        count = candidates.shape[1]
-        seeds = [TUNING_SEEDS + start for start in range(config.starts)] * count
-        envs = make_envs(env_id, len(seeds), **config.env_kwargs)
-        controller = sinusoid(envs, config, np.repeat(candidates.T, config.starts, axis=0))
-        outcome = rollout(controller, envs, seeds, record=False)
-        means = outcome.returns.reshape(count, config.starts).mean(axis=1)
-        episodes += len(seeds)
-        history.append(float(max([*history[-1:], means.max()])))
-        report(len(history), config.generations + 1, f"return {history[-1]:.0f}")
-        return -means
-
-    result = differential_evolution(
-        loss,  # type: ignore[arg-type]  # the stubs forget that a vectorized function returns an array
-        ranges,
-        popsize=max(1, config.population // len(ranges.lb)),
-        maxiter=config.generations,
-        rng=np.random.default_rng(config.seed),
-        vectorized=True,
-        updating="deferred",
-        polish=False,
-        tol=0,
-    )
-    return Tuned(result.x.tolist(), history, episodes)
-
-
-def tune_piece(env_id: str, config: GaitConfig, out: Path, report: Report = ignore) -> None:
-    """Tune a gait and write it, unless that is done."""
-    path = gait_path(env_id, config, out)
-    if path.exists():
-        return
-    wall, cpu = time.perf_counter(), time.process_time()
-    tuned = tune(env_id, config, report)
-    result = dataclasses.asdict(tuned) | {
-        "wall_s": time.perf_counter() - wall,
-        "cpu_s": time.process_time() - cpu,
-        "versions": versions(),
-    }
-    write_json(path, {"settings": gait_settings(env_id, config), "result": result})
-
-
-def gait_settings(env_id: str, config: GaitConfig) -> dict[str, Any]:
-    """All that a tuned gait follows from."""
-    return settings(env_id, _CODE, gait=config)
-
-
-def gait_path(env_id: str, config: GaitConfig, out: Path) -> Path:
-    """File of a tuned gait."""
-    return piece_path(out, gait_settings(env_id, config), "gait")
+def _ratio(joints: Joints, config: GaitConfig | TorqueConfig) -> Array:
+    return np.where(joints.cyclic, config.cyclic_ratio, 1.0)
 
 
 def _stack(rows: Array, like: Array) -> Array:

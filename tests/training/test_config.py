@@ -14,16 +14,18 @@ from training.config import (
     TUNING_SEEDS,
     EvaluationConfig,
     GaitConfig,
+    LawConfig,
     PPOConfig,
+    TorqueConfig,
     check_env_id,
     for_env,
     quick,
     training_seed,
     within,
 )
-from training.gaits import gait_path
 from training.store import digest, piece_path, read_json, settings, write_bytes, write_json
 from training.train import ppo_path
+from training.tuning import gait_path
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 
@@ -34,6 +36,8 @@ def changed(value):
         return not value
     if isinstance(value, dict):
         return {**value, "drag": True}
+    if isinstance(value, str) or value is None:
+        return f"{value} and more"
     return (*value[:-1], value[-1] + 1) if isinstance(value, tuple) else value + 1
 
 
@@ -54,9 +58,16 @@ def test_path_of_a_run_depends_on_every_setting(tmp_path, name):
     assert ppo_path(SNAKEBOARD, config, 0, tmp_path) != ppo_path(SNAKEBOARD, other, 0, tmp_path)
 
 
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(GaitConfig)])
-def test_path_of_a_gait_depends_on_every_setting(tmp_path, name):
-    config = GaitConfig()
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        (config, field.name)
+        for config in (GaitConfig(), TorqueConfig(), LawConfig(mechanism="roller_racer", law="relay"))
+        for field in dataclasses.fields(config)
+    ],
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
+)
+def test_path_of_a_gait_depends_on_every_setting(tmp_path, config, name):
     other = dataclasses.replace(config, **{name: changed(getattr(config, name))})
     assert gait_path(SNAKEBOARD, config, tmp_path) != gait_path(SNAKEBOARD, other, tmp_path)
 

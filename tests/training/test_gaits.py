@@ -1,17 +1,16 @@
-import dataclasses
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from mechanics.expressions import ExpressionError
 from mechanics.model import Model
-from training.config import COMPARED, EvaluationConfig, GaitConfig, for_env
-from training.evaluate import evaluate, make_envs, measure, rollout
-from training.gaits import Gait, Joints, Sinusoid, bounds, gait_path, sinusoid, tune, tune_piece
-from training.store import read_json
+from training.config import COMPARED, GaitConfig, TorqueConfig
+from training.evaluate import make_envs, measure, rollout
+from training.gaits import Feedback, Gait, Joints, Sinusoid
+from training.tuning import controller, family
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
-TINY = GaitConfig(population=16, generations=4, starts=1)
+GOAL = "nhenv/SnakeboardGoal-v0"
 
 every_environment = pytest.mark.parametrize("env_id", COMPARED)
 
@@ -68,7 +67,7 @@ def test_computed_torque_overcomes_the_drag_that_acts(env_id):
 
 
 # A fixed gait, and one that grows while it slows down.
-@pytest.mark.parametrize("last", [lambda m: (), lambda m: (np.full(m, 0.3), [1.0], [0.0])])
+@pytest.mark.parametrize("last", [lambda m: (), lambda m: (np.full(m, 0.3), [1.0])])
 @every_environment
 def test_weak_gait_follows_its_reference(env_id, last):
     envs = make_envs(env_id, 3, whole_state=True)
@@ -99,8 +98,8 @@ def test_snakeboard_goes_back_in_phase_and_forth_in_antiphase(phase, direction):
 
 
 def test_cyclic_ratio_multiplies_the_rotor_only():
-    controller = sinusoid(make_envs(SNAKEBOARD, 1), GaitConfig(cyclic_ratio=2.0), np.ones(7))
-    rotor, steering = controller.gait.angle(0.7)
+    driver = controller(make_envs(SNAKEBOARD, 1), GaitConfig(cyclic_ratio=2.0), np.ones(7))
+    rotor, steering = driver.gait.angle(0.7)
     assert rotor == pytest.approx(np.sin(2 * 0.7 + 1))
     assert steering == pytest.approx(np.sin(0.7 + 1))
 
@@ -108,12 +107,12 @@ def test_cyclic_ratio_multiplies_the_rotor_only():
 @pytest.mark.parametrize("make", [gym.make, lambda env_id: make_envs(env_id, 2)])
 def test_gait_is_as_long_as_an_episode(make):
     config = GaitConfig(steered=True)
-    controller = sinusoid(make(SNAKEBOARD), config, np.array([1, 0.2, 0, 0, 9, 9, 4, 0.5, 0.4, 7, 0.1]))
-    np.testing.assert_allclose(controller.gait.frequency_rate, (7 - 4) / 15.0)
+    driver = controller(make(SNAKEBOARD), config, np.array([1, 0.2, 0, 0, 9, 9, 4, 0.5, 0.4, 7, 0.1]))
+    np.testing.assert_allclose(driver.gait.frequency_rate, (7 - 4) / 15.0)
 
 
 def test_schedule_arrives_where_it_should():
-    vector = np.array([1.0, 0.2, 0.1, -0.3, 9.0, 9.0, 4.0, 0.5, 0.4, 6.0, -0.7])
+    vector = np.array([1.0, 0.2, 0.1, -0.3, 9.0, 9.0, 4.0, 0.5, 0.4, 6.0])
     gait = Gait.from_vector(vector, np.ones(2), 15.0)
     step = 1e-6
     for t in (0.0, 7.0, 15.0):
@@ -126,63 +125,77 @@ def test_schedule_arrives_where_it_should():
 
 def test_steering_turns_joints_with_stops_against_the_heading():
     board = make_envs(SNAKEBOARD, 1)
-    joints = Joints(board)
     vector = np.array([0.0, 0.0, 0.0, 0.0, 15.0, 15.0, 1.0, 0.0, 0.0, 1.0, -0.4])
-    controller = Sinusoid(joints, Gait.from_vector(vector, np.ones(2), 15.0))
+    driver = controller(board, GaitConfig(steered=True), vector)
     observation, _ = board.reset(options={"q": [0, 0, 0.5, 0, 0]})
     for _ in range(60):  # 3 s, many times 1/kd
-        observation, *_ = board.step(controller(observation))
+        observation, *_ = board.step(driver(observation))
     # The rotor rests, so the heading stays and the steering settles where it is asked to be.
     assert board.q[0, 4] == pytest.approx(-0.4 * np.sin(0.5), rel=1e-3)
 
 
+def test_what_is_observed_of_a_target_scales_the_amplitudes_it_is_meant_for():
+    envs = make_envs(GOAL, 5)
+    joints = Joints(envs)
+    observations, _ = envs.reset(seed=4)
+    seen = joints.observed(observations)
+    ahead, left = seen["goal_ahead"], seen["goal_left"]
+    np.testing.assert_allclose(ahead**2 + left**2, 1.0, rtol=1e-6)  # float32 observations
+    rules = Feedback(steering=("goal_left", np.array(0.3)), limited=("3*goal_ahead", np.array(0.5)))
+    np.testing.assert_allclose(rules.offset(seen)[:, 0], 0.3 * left)
+    rotor, steering = rules.scale(seen, joints.cyclic).T
+    np.testing.assert_array_equal(rotor, 1.0)
+    np.testing.assert_allclose(steering, np.clip(1.5 * ahead, -1, 1))
+    assert len(set(np.abs(steering) < 1)) == 2  # some are cut off, some are not
+    rotor, steering = Feedback(cyclic=("goal_ahead", np.array(0.5))).scale(seen, joints.cyclic).T
+    np.testing.assert_allclose(rotor, 0.5 * ahead)
+    np.testing.assert_array_equal(steering, 1.0)
+
+
+def test_a_gait_whose_target_is_reached_rests():
+    envs = make_envs(SNAKEBOARD, 2, whole_state=True)
+    joints = Joints(envs)
+    gait = Gait.from_vector(np.array([3.0, 0.5, 0.2, 0.0, 15.0, 15.0, 4.0]), np.ones(2), 15.0)
+    nothing_left = ("speed - speed", np.array(1.0))
+    driver = Sinusoid(joints, gait, Feedback(cyclic=nothing_left, limited=nothing_left))
+    q = rollout(driver, envs, range(2)).q
+    # Its joints go to rest from where they start, phi within 0.05 rad of the middle, and the board stays.
+    assert np.abs(q[:, -1, 4]).max() < 1e-6
+    assert np.abs(q[:, -1, :3]).max() < 1e-3
+    moving = rollout(Sinusoid(joints, gait), envs, range(2)).q
+    assert np.abs(moving[:, -1, :2]).max(axis=1).min() > 0.1
+
+
+def test_feedback_of_what_is_not_observed_is_refused():
+    with pytest.raises(ExpressionError, match="unknown observation 'sin_heding'.*Did you mean 'sin_heading'"):
+        family(make_envs(SNAKEBOARD, 1), GaitConfig(steered=True, steered_by="-sin_heding"))
+
+
+def test_torque_sinusoid_looks_at_nothing_and_is_that():
+    envs = make_envs(SNAKEBOARD, 3)
+    vector = np.array([[0.5, 1.0, 0.1, -0.4, 3.0], [1.0, 0.2, 0.0, 2.0, 5.0], [0.0, 0.9, 1.0, 1.0, 2.0]])
+    driver = controller(envs, TorqueConfig(cyclic_ratio=2.0), vector)
+    driver.reset(3)
+    rng = np.random.default_rng(0)
+    given = np.array([driver(rng.normal(size=(3, 6)).astype(np.float32)) for _ in range(20)])
+    assert given.dtype == np.float32
+    t = 0.05 * np.arange(20)[:, None, None]
+    expected = vector[:, :2] * np.sin(vector[:, 4:] * [2.0, 1.0] * t + vector[:, 2:4])
+    np.testing.assert_allclose(given, expected, atol=1e-6)  # float32
+
+
 @pytest.mark.parametrize("steered", [False, True])
 @every_environment
-def test_bounds_respect_stops_and_sampling(env_id, steered):
+def test_ranges_respect_stops_and_sampling(env_id, steered):
     envs = make_envs(env_id, 1)
     joints, config = Joints(envs), GaitConfig(steered=steered)
-    ranges = bounds(joints, config)
-    m = len(joints.index)
-    low, high = (Gait.from_vector(np.asarray(side), np.ones(m), 1.0) for side in (ranges.lb, ranges.ub))
+    searched = family(envs, config)
+    m, ranges = len(joints.index), searched.bounds
+    low, high = (searched.controller(np.asarray(side)) for side in (ranges.lb, ranges.ub))
     assert ranges.lb.shape == ranges.ub.shape == (4 * m + 3 if steered else 3 * m + 1,)
     assert (ranges.lb < ranges.ub).all()
-    assert (low.amplitude == 0).all()
-    np.testing.assert_array_equal(high.amplitude, np.where(joints.cyclic, config.cyclic_amplitude, joints.stops))
-    assert (low.frequency.item(), high.frequency.item()) == config.frequency
-    assert (high.amplitude_rate == 0).all()  # the last amplitudes have the same range
-    assert high.damping.max() * envs.dt < 2  # beyond it the held feedback overshoots more each time
-
-
-def test_finished_gait_is_not_tuned_again(tmp_path):
-    tune_piece(SNAKEBOARD, TINY, tmp_path)
-    written = read_json(gait_path(SNAKEBOARD, TINY, tmp_path))
-    assert written["settings"]["gait"]["population"] == TINY.population
-    assert len(written["result"]["vector"]) == 7
-    tune_piece(SNAKEBOARD, TINY, tmp_path, lambda *message: pytest.fail("it tunes again"))
-
-
-def test_a_gait_is_tuned_and_judged_in_the_environment_that_is_asked_for():
-    weak = dataclasses.replace(TINY, generations=1, env_kwargs={"torque_limits": 0.01})
-    strong = dataclasses.replace(weak, env_kwargs={})
-    returns = [tune(SNAKEBOARD, config).history[-1] for config in (weak, strong)]
-    assert returns[0] < 0.1 * returns[1]
-    controller = sinusoid(make_envs(SNAKEBOARD, 1), TINY, np.ones(7))
-    judged = EvaluationConfig(episodes=2, env_kwargs={"torque_limits": 0.01})
-    asked = evaluate(controller, SNAKEBOARD, judged)[0].torques[:, 0]
-    plain = evaluate(controller, SNAKEBOARD, EvaluationConfig(episodes=2))[0].torques[:, 0]
-    twice = evaluate(controller, SNAKEBOARD, judged, torque_limits=0.02)[0].torques[:, 0]
-    assert asked == pytest.approx(plain * [0.01, 0.02])  # the same actions; by default 1 and 0.5 N m
-    assert twice == pytest.approx(2 * asked)
-
-
-def test_tuning_improves_on_its_start_and_is_reproducible():
-    heard = []
-    tuned = tune(SNAKEBOARD, TINY, lambda *message: heard.append(message[:2]))
-    assert tuned.history == sorted(tuned.history)
-    assert tuned.history[-1] > tuned.history[0]
-    assert heard == [(done, 5) for done in range(1, 6)]
-    assert tuned.episodes == 5 * 14  # 16 candidates are rounded down to a multiple of 7 parameters
-    assert tune(SNAKEBOARD, TINY) == tuned
-    gait = sinusoid(make_envs(SNAKEBOARD, 1), TINY, tuned.vector)
-    episodes, _ = evaluate(gait, SNAKEBOARD, for_env(SNAKEBOARD).evaluation)
-    assert episodes.returns.mean() == pytest.approx(tuned.history[-1], rel=0.05)  # starts differ by 0.1 rad
+    assert (low.gait.amplitude == 0).all()
+    np.testing.assert_array_equal(high.gait.amplitude, np.where(joints.cyclic, config.cyclic_amplitude, joints.stops))
+    assert (low.gait.frequency.item(), high.gait.frequency.item()) == config.frequency
+    assert (high.gait.amplitude_rate == 0).all()  # the last amplitudes have the same range
+    assert high.gait.damping.max() * envs.dt < 2  # beyond it the held feedback overshoots more each time
