@@ -252,6 +252,18 @@ CONFIGS: dict[str, TaskConfig] = {
             "steered either way": GaitConfig(steered=True, steered_by="goal_left", limited_by="goal_ahead"),
         }
     ),
+    # Ostrowski's gaits: what is left to turn, or to go sideways, decides how large they are and which way they work.
+    "Turn": TaskConfig(
+        gaits={"sinusoid 2:1": GaitConfig(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")}
+    ),
+    "Park": TaskConfig(
+        gaits={
+            "sinusoid 3:2": GaitConfig(cyclic_ratio=1.5, limited_by="place_left", gain=20.0),
+            "steered sinusoid 3:2": GaitConfig(
+                cyclic_ratio=1.5, limited_by="place_left", gain=20.0, steered=True, steered_by="sin_to_turn"
+            ),
+        }
+    ),
 }
 
 # The environments of the main job: the paper's two mechanisms, whose gaits are known.
