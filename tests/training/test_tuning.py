@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from training.config import COMPARED, CONFIGS, EvaluationConfig, GaitConfig, Law
 from training.evaluate import evaluate, make_envs
 from training.laws import LAWS
 from training.store import read_json
-from training.tuning import FAMILIES, controller, family, gait_path, tune, tune_piece
+from training.tuning import FAMILIES, controller, family, gait_path, gait_settings, search_config, tune, tune_piece
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = GaitConfig(population=16, generations=4, starts=1)
@@ -102,3 +103,12 @@ def test_tuning_improves_on_its_start_and_is_reproducible(config):
     driver = controller(make_envs(SNAKEBOARD, 1), config, tuned.vector)
     episodes, _ = evaluate(driver, SNAKEBOARD, for_env(SNAKEBOARD).evaluation)
     assert episodes.returns.mean() == pytest.approx(tuned.history[-1], rel=0.05)  # starts differ by 0.1 rad
+
+
+@pytest.mark.parametrize("config", KINDS, ids=lambda config: type(config).__name__)
+def test_settings_are_read_back(config):
+    data = json.loads(json.dumps(gait_settings(SNAKEBOARD, config)))
+    back = search_config(data)
+    assert type(back) is type(config)
+    assert gait_settings(SNAKEBOARD, back)["gait"].keys() == gait_settings(SNAKEBOARD, config)["gait"].keys()
+    assert json.loads(json.dumps(gait_settings(SNAKEBOARD, back))) == data
