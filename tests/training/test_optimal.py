@@ -1,0 +1,179 @@
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from training import optimal
+from training.config import COMPARED
+from training.evaluate import make_envs
+from training.optimal import FOLDER, Optimal, Reference, improve, load, path_of, recorded, reference, replay, search
+
+CELLS = [(env_id, drag) for env_id in COMPARED for drag in (False, True)]
+SNAKEBOARD, RACER = COMPARED
+
+# What others' optimal control had found, in metres: the least that ours must reach.
+BEFORE = dict(zip(CELLS, (51.0, 14.85, 32.4, 14.04), strict=True))
+
+every_cell = pytest.mark.parametrize(("env_id", "drag"), CELLS)
+
+
+@every_cell
+def test_reference_reaches_what_was_known_before(env_id, drag):
+    assert reference(env_id, drag) >= BEFORE[env_id, drag]
+
+
+@every_cell
+def test_reference_replays_in_the_environments(env_id, drag):
+    known = load(env_id, drag)
+    assert known.actions.dtype == np.float32
+    assert np.abs(known.actions).max() <= 1
+    assert len(known.actions) == gym.spec(env_id).max_episode_steps
+    assert replay(known) == pytest.approx(known.distance_m, abs=1e-3)
+    for substeps in (None, 10):  # interpreted, which spares a compilation for each
+        env = gym.make(env_id, drag=drag, backend="numpy", substeps=substeps)
+        env.reset(options={"q": np.zeros(env.unwrapped.mechanism.n)})
+        covered = 0.0
+        for action in known.actions:
+            _, _, terminated, truncated, info = env.step(action)
+            covered += info["reward_forward"] * env.unwrapped.dt
+        assert truncated
+        assert not terminated
+        assert covered == pytest.approx(known.distance_m, abs=1e-3)
+
+
+@every_cell
+def test_reference_is_a_maximum_among_its_neighbours(env_id, drag):
+    known = load(env_id, drag)
+    envs = make_envs(env_id, 256, drag=drag, whole_state=True)
+    rng = np.random.default_rng(0)
+    # Noise in a random stretch of the episode, also a single hold.
+    first, length = rng.integers(0, 300, 256), rng.integers(1, 40, 256)
+    steps = np.arange(300)
+    within = (steps >= first[:, None]) & (steps < (first + length)[:, None])
+    noise = rng.normal(0, 0.05, (256, *known.actions.shape)) * within[..., None]
+    actions = np.clip(known.actions + noise, -1, 1).astype(np.float32)
+    envs.reset(options={"q": np.zeros(envs.mechanism.n)})
+    returns = sum(envs.step(np.ascontiguousarray(actions[:, i]))[1] for i in steps)
+    # The return without what efforts cost, which is 0.02 times the mean square of the actions.
+    covered = (returns + 0.02 * (actions**2).mean(axis=2).sum(axis=1)) * envs.dt
+    assert covered.max() < known.distance_m + 0.01
+
+
+def test_no_reference_where_nobody_has_looked():
+    assert reference("nhenv/SnakeboardGoal-v0") is None
+    assert reference(SNAKEBOARD, {"C": 0.5}) is None
+    assert reference(SNAKEBOARD) == reference(SNAKEBOARD, False) != reference(SNAKEBOARD, True)
+
+
+def test_reference_survives_its_file_to_the_last_bit(tmp_path):
+    actions = np.random.default_rng(0).uniform(-1, 1, (300, 2)).astype(np.float32)
+    Reference(env_id=SNAKEBOARD, drag=True, distance_m=1.5, actions=actions, found={"x": 1}).write(tmp_path / "a.json")
+    again = Reference.read(tmp_path / "a.json")
+    assert again.actions.dtype == np.float32
+    np.testing.assert_array_equal(again.actions, actions)
+    assert (again.env_id, again.drag, again.distance_m, again.found) == (SNAKEBOARD, True, 1.5, {"x": 1})
+
+
+def test_controllers_are_recorded_as_they_are_replayed():
+    class Swing:
+        def reset(self, episodes):
+            self.steps = 0
+
+        def __call__(self, observations):
+            self.steps += 1
+            return np.full((1, 1), 3 * np.sin(self.steps / 3) - observations[0, 0], np.float32)
+
+    actions = recorded(Swing(), RACER, False)
+    assert actions.shape == (300, 1)
+    assert np.abs(actions).max() == 1
+    envs = make_envs(RACER, 1, whole_state=True)
+    swing = Swing()
+    swing.reset(1)
+    observations, _ = envs.reset(options={"q": np.zeros(4)})
+    for _ in range(300):
+        observations, *_ = envs.step(swing(observations))
+    known = Reference(env_id=RACER, drag=False, distance_m=0.0, actions=actions)
+    assert replay(known) == pytest.approx(-envs.q[0, 0], abs=1e-9)
+
+
+def test_search_only_ever_improves():
+    start = 0.5 * np.sin(np.arange(300) / 3)[:, None]
+    heard = []
+    distance, actions = search(RACER, False, start, hops=2, rounds=8, found=lambda metres, _: heard.append(metres))
+    before = replay(Reference(env_id=RACER, drag=False, distance_m=0.0, actions=start.astype(np.float32)))
+    assert heard == sorted(heard)
+    assert heard[-1] == distance > before + 5
+    again = Reference(env_id=RACER, drag=False, distance_m=distance, actions=actions)
+    assert replay(again) == pytest.approx(distance, abs=1e-9)
+
+
+def test_swings_hold_then_swing():
+    numbers = np.array([0.25, 0.5, 0.5, 1.0, 0.0, 0.5, 0.1, 0.0, 0.25])  # share, two frequencies, two of each kind
+    actions = optimal.swings(numbers, 300)
+    assert actions.shape == (300, 2)
+    assert (actions[:75] == [1.0, -1.0]).all()
+    assert np.abs(actions[75:, 1]).max() == pytest.approx(0.2, abs=1e-3)
+    assert np.abs(actions).max() <= 1
+    np.testing.assert_array_equal(optimal.swings(np.stack([numbers, numbers]), 300)[1], actions)
+
+
+def test_what_is_known_is_only_replaced_by_better(tmp_path):
+    path = path_of(RACER, False, tmp_path)
+    load(RACER, False).write(path)
+    before = path.read_bytes()
+    improve(RACER, False, hops=1, seed=0, fresh=False, folder=tmp_path)
+    after = Reference.read(path)
+    assert path.read_bytes() == before or after.distance_m > reference(RACER, False)
+
+
+def test_impossible_options_are_refused():
+    with pytest.raises(ValueError, match="did you mean"):
+        Optimal(env_ids=("nhenv/SnakebordForward-v0",))
+    with pytest.raises(ValueError, match="at least 1"):
+        Optimal(hops=0)
+
+
+@pytest.mark.slow
+def test_interrupting_keeps_what_was_found(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "training.optimal",
+        "--fresh",
+        "--out",
+        str(tmp_path),
+        "--env-ids",
+        RACER,
+        "--no-drag",
+    ]
+    process = subprocess.Popen([*command, "--hops", "10000"], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    path = path_of(RACER, False, tmp_path)
+    try:
+        until = time.monotonic() + 120
+        while not path.exists():
+            assert time.monotonic() < until
+            assert process.poll() is None
+            time.sleep(0.1)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert "what was found is kept" in errors
+    assert "Traceback" not in errors
+    found = Reference.read(path)
+    assert replay(found) == pytest.approx(found.distance_m, abs=1e-9)
+
+
+def test_files_are_those_of_the_cells():
+    assert {path.name for path in FOLDER.iterdir()} == {path_of(*cell).name for cell in CELLS}
+    for cell in CELLS:
+        known = load(*cell)
+        assert (known.env_id, known.drag) == cell
+        assert dataclasses.asdict(known)["found"]["cpu_s"] > 0
