@@ -77,10 +77,10 @@ class Compare:
     def config(self, env_id: str) -> TaskConfig:
         """Settings for an environment."""
         config = settings_of.for_env(env_id)
-        if self.quick:
-            config = settings_of.quick(config)
         if self.drag:
             config = settings_of.within(config, drag=True)
+        if self.quick:
+            config = settings_of.quick(config)
         if self.timesteps is not None:
             config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, timesteps=self.timesteps))
         return config

@@ -166,7 +166,7 @@ class PPOConfig:
         reward_scale: what rewards are multiplied by. Value function and policy share a limit on the gradient, and
             returns of hundreds leave nothing of it to the policy.
         start_energy: J; episodes begin in motion, with up to this much, ever fewer of them; 0 for none.
-        start_share: part of the training after which all begin at rest.
+        start_share: part of the training after which all begin at rest; beyond 1, some always begin in motion.
         hidden: units of each tanh layer; policy and value function share none.
         curve_every: updates between two points of the learning curve.
         curve_episodes: episodes of the deterministic policy behind each point.
@@ -218,6 +218,7 @@ class TaskConfig:
     Attributes:
         gaits: by name, with equal budgets; each where it fits the mechanism. The first is drawn beside the policy.
         ppo: what trains the policy.
+        ppo_with_drag: what trains it where drag acts; None for the same.
         evaluation: what judges both.
     """
 
@@ -233,11 +234,16 @@ class TaskConfig:
         }
     )
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    ppo_with_drag: PPOConfig | None = None
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
 CONFIGS: dict[str, TaskConfig] = {
-    "Forward": TaskConfig(),
+    # Without drag, momentum lasts: a policy has to look seconds ahead to see that it pays to charge first.
+    "Forward": TaskConfig(
+        ppo=PPOConfig(reward_scale=0.02, gamma=0.996, entropy=0.003, start_energy=150.0, start_share=1.25),
+        ppo_with_drag=PPOConfig(reward_scale=0.05),
+    ),
     "Velocity": TaskConfig(
         # The more speed is missing, the larger the swing; a joint that swings the other way brakes.
         gaits={
@@ -282,10 +288,11 @@ def quick(config: TaskConfig) -> TaskConfig:
 
 def within(config: TaskConfig, **env_kwargs: Any) -> TaskConfig:
     """The same experiment in an environment made with these arguments: tuned, trained and judged there."""
+    ppo = config.ppo_with_drag if env_kwargs.get("drag") and config.ppo_with_drag else config.ppo
     return dataclasses.replace(
         config,
         gaits={name: dataclasses.replace(gait, env_kwargs=env_kwargs) for name, gait in config.gaits.items()},
-        ppo=dataclasses.replace(config.ppo, env_kwargs=env_kwargs),
+        ppo=dataclasses.replace(ppo, env_kwargs=env_kwargs),
         evaluation=dataclasses.replace(config.evaluation, env_kwargs=env_kwargs),
     )
 
