@@ -251,13 +251,14 @@ def main(options: Evaluate) -> None:
         controller.require(envs.observation_labels)
     _, numbers = evaluate(controller, env_id, config, substeps=options.substeps)
     made_with = "".join(f", {name}={value}" for name, value in config.env_kwargs.items())
-    table = Table(title=f"{env_id}{made_with}: {options.episodes} episodes")
-    for heading in ("", "estimate", "95 % interval", "mean", "std", "min", "max"):
+    title = f"{env_id}{made_with}: {options.episodes} episodes, interquartile means (of success the mean)"
+    table = Table(title=title)
+    for heading in ("", "estimate", "95 % interval", "min", "max"):
         table.add_column(heading, justify="right")
     for metric in metrics_of(envs.task):
         one = summary(numbers[metric.name], metric.statistic)
-        low, high, *others = (f"{one[key]:.4g}" for key in ("low", "high", "mean", "std", "min", "max"))
-        table.add_row(f"{metric.name}, {metric.statistic}", f"{one['estimate']:.4g}", f"{low} to {high}", *others)
+        estimate, low, high, least, most = (f"{one[key]:.4g}" for key in ("estimate", "low", "high", "min", "max"))
+        table.add_row(metric.name, estimate, f"{low} to {high}", least, most)
     Console().print(table)
 
 

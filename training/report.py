@@ -110,7 +110,7 @@ def _table(one: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def _number(value: float | None, digits: int) -> str:
     """A number, if it is one: the cost of transport of what does not move is none."""
-    return NOTHING if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+    return NOTHING if value is None or not math.isfinite(value) else f"{value:z.{digits}f}"
 
 
 def _line(cells: Iterable[str]) -> str:

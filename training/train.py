@@ -31,6 +31,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from stable_baselines3.common.vec_env import VecEnv
 
 from nhenv.sb3 import make_sb3_vec_env
+from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed, within
 from training.evaluate import PolicyController, measure, recorded, rollout
 from training.metrics import headline
@@ -61,7 +62,8 @@ class Run(BaseCallback):
     There, the model, the environments and the random generators are all that there is to remember.
 
     Attributes:
-        curve: points {"steps", "cpu_s", METRIC: mean} of the deterministic policy, with every metric of the task.
+        curve: points {"steps", "cpu_s", METRIC: mean} of the deterministic policy, with every metric of the task. The
+            CPU seconds count from when the kernels are compiled, and the drawing of the curve is in them.
         best: the policy's parameters at the point with the largest return, and that point's steps. Gaits are chosen on
             the same starts; nobody is judged on them.
     """
@@ -73,6 +75,7 @@ class Run(BaseCallback):
         self.best: dict[str, Any] = {"steps": 0, "return": -math.inf, "parameters": {}}
         self._envs = recorded(env_id, config.curve_episodes, **config.env_kwargs)
         self._headline = headline(self._envs.task)
+        _compile(self._envs, env_id, config)  # once on a machine, so it is not what learning costs
         self._before = {"wall_s": 0.0, "cpu_s": 0.0}  # spent before an interruption
         self._began = _clocks()
 
@@ -145,6 +148,16 @@ def make_envs_to_learn_in(env_id: str, config: PPOConfig, seed: int) -> VecEnv:
         steps = round(config.start_share * config.timesteps)
         envs = MovingStarts(plain, config.start_energy, steps, training_seed(seed))
     return ScaledReward(envs, config.reward_scale)
+
+
+def _compile(envs: LocomotionVectorEnv, env_id: str, config: PPOConfig) -> None:
+    """Have the kernels made, of these environments and of those in which the policy learns, if they are not cached."""
+    controls = len(envs.mechanism.controls)
+    envs.reset()
+    envs.step(np.zeros((envs.num_envs, controls), np.float32))
+    learning = make_sb3_vec_env(env_id, 1, **config.env_kwargs)  # others of its kind: a reset would use up the seeds
+    learning.reset()
+    learning.step(np.zeros((1, controls), np.float32))
 
 
 def arguments(config: PPOConfig) -> dict[str, Any]:

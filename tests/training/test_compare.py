@@ -100,14 +100,15 @@ def test_every_controller_is_judged_again_at_a_tenth_of_the_step(finished):
 
     def evaluate(controller, env_id, config, **kwargs):
         asked.append(kwargs)
-        return training.evaluate.evaluate(controller, env_id, config, **kwargs)
+        return training.evaluate.evaluate(controller, env_id, config)
 
     for env_id, own in ((SNAKEBOARD, 1), ("nhenv/RollerRacerForward-v0", 2)):
         assert make_envs(env_id, 1).substeps == own
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("training.compare.evaluate", evaluate)
+        patch.setattr("nhenv.vector_env.LocomotionVectorEnv.substeps", 3)
         judge(SNAKEBOARD, options)
-    assert asked == [{}, {"substeps": 2}] * 2  # a gait and a policy; TINY asks for half a step
+    assert asked == [{}, {"substeps": 6}] * 2  # a gait and a policy; TINY asks for half a step
 
 
 def test_shares_of_the_strongest_known_and_times_to_pass_are_shown(finished):

@@ -81,6 +81,7 @@ def test_ranges_are_filled_evenly_on_their_scales():
         assert np.abs(counts - 16).max() <= 2, name
     assert all(isinstance(one["n_steps"], int) for one in drawn)
     assert combinations(ranges, 8) == drawn[:8]
+    assert all(0 < values[0] < 1 for values in shares.values())  # not in a corner
     assert len(combinations(ranges | {"n_epochs": ("1", "2")}, 8)) == 16
 
 

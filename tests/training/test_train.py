@@ -168,3 +168,11 @@ def test_first_episodes_end_out_of_phase_and_later_ones_do_not():
     assert len(set(first)) == count
     assert all(1 <= time <= 300 for time in first)
     assert all(times[1] - times[0] == 300 for times in ends)
+
+
+def test_seconds_of_a_run_do_not_count_compilation(tmp_path, monkeypatch):
+    order = []
+    monkeypatch.setattr("training.train._compile", lambda *arguments: order.append("compiled"))
+    monkeypatch.setattr("training.train._clocks", lambda: order.append("looked at the clock") or {})
+    Run(SNAKEBOARD, TINY, tmp_path, ignore)
+    assert order == ["compiled", "looked at the clock"]
