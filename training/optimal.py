@@ -105,7 +105,7 @@ def replay(known: Reference, **env_kwargs: Any) -> float:
 
 def recorded(controller: Controller, env_id: str, drag: bool) -> NDArray[np.float32]:
     """Actions (T, m) of a controller from where references begin: somewhere for a search to start."""
-    envs = make_envs(env_id, 1, drag=drag)
+    envs = make_envs(env_id, 1, drag=drag, whole_state=True)
     controller.reset(1)
     observations, _ = envs.reset(options={"q": np.zeros(envs.mechanism.n)})
     actions, running = [], True
@@ -139,7 +139,7 @@ def swings(numbers: Array, steps: int) -> Array:
 def _best_swings(env_id: str, drag: bool, seed: int, report: Report, generations: int = 100) -> Array:
     """Actions (T, m) of the family's best, by differential evolution."""
     size = 512
-    envs = make_envs(env_id, size, drag=drag)
+    envs = make_envs(env_id, size, drag=drag, whole_state=True)  # the kernel of all that follows
     steps, m = envs.max_episode_steps, len(envs.mechanism.controls)
     assert steps is not None
     rounds = 0
