@@ -76,9 +76,7 @@ class Compare:
 
     def config(self, env_id: str) -> TaskConfig:
         """Settings for an environment."""
-        config = settings_of.for_env(env_id)
-        if self.drag:
-            config = settings_of.within(config, drag=True)
+        config = settings_of.for_env(env_id, self.drag)
         if self.quick:
             config = settings_of.quick(config)
         if self.timesteps is not None:

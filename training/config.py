@@ -218,7 +218,7 @@ class TaskConfig:
     Attributes:
         gaits: by name, with equal budgets; each where it fits the mechanism. The first is drawn beside the policy.
         ppo: what trains the policy.
-        ppo_with_drag: what trains it where drag acts; None for the same.
+        ppo_of: mechanism -> what trains its policy instead, where no drag acts.
         evaluation: what judges both.
     """
 
@@ -234,15 +234,17 @@ class TaskConfig:
         }
     )
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    ppo_with_drag: PPOConfig | None = None
+    ppo_of: dict[str, PPOConfig] = field(default_factory=dict)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
 CONFIGS: dict[str, TaskConfig] = {
-    # Without drag, momentum lasts: a policy has to look seconds ahead to see that it pays to charge first.
     "Forward": TaskConfig(
-        ppo=PPOConfig(reward_scale=0.02, gamma=0.996, entropy=0.003, start_energy=150.0, start_share=1.25),
-        ppo_with_drag=PPOConfig(reward_scale=0.05),
+        ppo=PPOConfig(reward_scale=0.05),
+        # Without drag its momentum lasts: a policy has to look seconds ahead to see that it pays to charge first.
+        ppo_of={
+            "snakeboard": PPOConfig(reward_scale=0.02, gamma=0.996, entropy=0.003, start_energy=150.0, start_share=1.25)
+        },
     ),
     "Velocity": TaskConfig(
         # The more speed is missing, the larger the swing; a joint that swings the other way brakes.
@@ -288,11 +290,10 @@ def quick(config: TaskConfig) -> TaskConfig:
 
 def within(config: TaskConfig, **env_kwargs: Any) -> TaskConfig:
     """The same experiment in an environment made with these arguments: tuned, trained and judged there."""
-    ppo = config.ppo_with_drag if env_kwargs.get("drag") and config.ppo_with_drag else config.ppo
     return dataclasses.replace(
         config,
         gaits={name: dataclasses.replace(gait, env_kwargs=env_kwargs) for name, gait in config.gaits.items()},
-        ppo=dataclasses.replace(ppo, env_kwargs=env_kwargs),
+        ppo=dataclasses.replace(config.ppo, env_kwargs=env_kwargs),
         evaluation=dataclasses.replace(config.evaluation, env_kwargs=env_kwargs),
     )
 
@@ -305,13 +306,19 @@ def check_env_id(env_id: str) -> str:
     return env_id
 
 
-def for_env(env_id: str) -> TaskConfig:
-    """Settings for the task of this environment, with the gaits that fit its mechanism."""
+def for_env(env_id: str, drag: bool = False) -> TaskConfig:
+    """Settings for the task of this environment, with the gaits and the training that fit its mechanism.
+
+    Args:
+        env_id: environment.
+        drag: whether the mechanism's drag acts where it is tuned, trained and judged.
+    """
     config = CONFIGS[task_name(check_env_id(env_id))]
     mechanism = as_mechanism(gym.spec(env_id).kwargs["mechanism"]).name
-    return dataclasses.replace(
-        config, gaits={name: gait for name, gait in config.gaits.items() if gait.fits(mechanism)}
-    )
+    gaits = {name: gait for name, gait in config.gaits.items() if gait.fits(mechanism)}
+    ppo = config.ppo if drag else config.ppo_of.get(mechanism, config.ppo)
+    config = dataclasses.replace(config, gaits=gaits, ppo=ppo)
+    return within(config, drag=True) if drag else config
 
 
 def training_seed(run: int) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import nhenv
-from training.config import CONFIGS, PPOConfig, task_name
+from training.config import CONFIGS, PPOConfig, for_env, task_name
 from training.store import write_bytes
 from training.train import Linear, arguments
 
@@ -44,7 +44,9 @@ def text() -> str:
         lines += [f"{task}: &{task}", *(f"  {name}: {value}" for name, value in entry(config.ppo).items()), ""]
     for env_id in sorted(nhenv.environment_ids()):
         if (task := task_name(env_id)) in CONFIGS:
-            lines += [f"{env_id}:", f"  <<: *{task}"]
+            own, shared = entry(for_env(env_id).ppo), entry(CONFIGS[task].ppo)
+            changes = [f"  {name}: {value}" for name, value in own.items() if value != shared[name]]
+            lines += [f"{env_id}:", f"  <<: *{task}", *changes]
     return "\n".join(lines) + "\n"
 
 

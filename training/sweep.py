@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import qmc
 
-from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, within
+from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env
 from training.evaluate import evaluate, load_policy, make_envs
 from training.metrics import headline
 from training.options import Seeds, check_seeds
@@ -150,7 +150,7 @@ class Sweep:
 
     def settings(self) -> list[tuple[dict[str, Any], PPOConfig]]:
         """Each setting: what is varied, and the whole of it."""
-        config = within(for_env(self.env_id), **({"drag": True} if self.drag else {})).ppo
+        config = for_env(self.env_id, self.drag).ppo
         return [(one, dataclasses.replace(config, **one)) for one in combinations(self.fields, self.draws)]
 
     def jobs(self) -> list[Job]:
@@ -166,7 +166,7 @@ class Sweep:
 def sweep(options: Sweep, command: Sequence[str], console: Console) -> dict[str, Any]:
     """Train what is left to train, judge everything, write sweep.json and sweep.md; return what the former holds."""
     run_jobs(options.jobs(), options.processes, console)
-    judging = within(for_env(options.env_id), **({"drag": True} if options.drag else {})).evaluation
+    judging = for_env(options.env_id, options.drag).evaluation
     metric = headline(make_envs(options.env_id, 1, **judging.env_kwargs).task)
     rows: list[dict[str, Any]] = []
     for varied, config in options.settings():

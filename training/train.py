@@ -32,7 +32,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from nhenv.sb3 import make_sb3_vec_env
 from nhenv.vector_env import LocomotionVectorEnv
-from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed, within
+from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
 from training.evaluate import PolicyController, measure, recorded, rollout
 from training.metrics import headline
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
@@ -274,7 +274,7 @@ class Train:
 
 def main(options: Train) -> None:
     """Train under a progress bar."""
-    config = within(for_env(options.env_id), **({"drag": True} if options.drag else {})).ppo
+    config = for_env(options.env_id, options.drag).ppo
     if options.timesteps is not None:
         config = dataclasses.replace(config, timesteps=options.timesteps)
     path = ppo_path(options.env_id, config, options.seed, options.out).with_suffix(".zip")
