@@ -89,9 +89,11 @@ def register(mechanism: MechanismLike, tasks: Iterable[TaskLike] | None = None) 
 
 def register_catalogue() -> None:
     """Register every task for every mechanism of the catalogue that moves in the plane by controls of its own."""
-    for task in TASKS:
-        for mechanism in mechanics.names(in_the_plane=True, any_pose=task.any_pose):
-            _register(environment_id(mechanism, task), mechanism, task.name, task.max_episode_steps)
+    for mechanism in mechanics.names(in_the_plane=True):
+        any_pose = mechanism in mechanics.names(any_pose=True)
+        for task in TASKS:
+            if any_pose or not task.any_pose:
+                _register(environment_id(mechanism, task), mechanism, task.name, task.max_episode_steps)
 
 
 def environment_id(mechanism: str, task: Task) -> str:

@@ -9,8 +9,6 @@ them in one harness and writes results.json, results.md and a figure for each en
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import importlib.util
 import os
 import shlex
 import sys
@@ -30,6 +28,7 @@ from training import config as settings_of
 from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id
 from training.evaluate import Controller, Rollout, evaluate, load_policy, make_envs
 from training.metrics import headline, metrics_of
+from training.optimal import reference
 from training.options import Seeds, check_seeds
 from training.plots import GAITS, POLICY, Shown, draw
 from training.progress import Job, run_jobs
@@ -125,12 +124,7 @@ def strongest_known(env_id: str, env_kwargs: Mapping[str, Any]) -> float | None:
     """Distance in m that direct optimal control reaches; None where it was not asked, or in another environment."""
     if set(env_kwargs) - {"drag"} or not isinstance(env_kwargs.get("drag", False), bool):
         return None
-    if importlib.util.find_spec("training.optimal") is None:
-        return None
-    distance: float | None = importlib.import_module("training.optimal").reference(
-        env_id, env_kwargs.get("drag", False)
-    )
-    return distance
+    return reference(env_id, env_kwargs.get("drag", False))
 
 
 def judge(env_id: str, options: Compare) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 import nhenv
 from training.config import CONFIGS, PPOConfig, for_env, task_name
 from training.store import write_bytes
@@ -43,7 +45,8 @@ def text() -> str:
     for task, config in CONFIGS.items():
         lines += [f"{task}: &{task}", *(f"  {name}: {value}" for name, value in entry(config.ppo).items()), ""]
     for env_id in sorted(nhenv.environment_ids()):
-        if (task := task_name(env_id)) in CONFIGS:
+        of_the_catalogue = isinstance(gym.spec(env_id).kwargs["mechanism"], str)
+        if of_the_catalogue and (task := task_name(env_id)) in CONFIGS:
             own, shared = entry(for_env(env_id).ppo), entry(CONFIGS[task].ppo)
             changes = [f"  {name}: {value}" for name, value in own.items() if value != shared[name]]
             lines += [f"{env_id}:", f"  <<: *{task}", *changes]

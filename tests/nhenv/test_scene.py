@@ -130,10 +130,12 @@ def test_names_do_not_matter(actions):
 
 
 def test_ids_are_camel_case_of_their_mechanisms():
-    assert nhenv.environment_ids()[:4] == (
+    assert nhenv.environment_ids()[:6] == (
         "nhenv/SnakeboardForward-v0",
         "nhenv/SnakeboardVelocity-v0",
         "nhenv/SnakeboardGoal-v0",
+        "nhenv/SnakeboardTurn-v0",
+        "nhenv/SnakeboardPark-v0",
         "nhenv/RollerRacerForward-v0",
     )
 

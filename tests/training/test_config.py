@@ -108,10 +108,17 @@ def test_quick_is_shorter():
 
 
 def test_an_experiment_within_an_environment_is_so_in_all_its_parts():
-    config = within(for_env(SNAKEBOARD), drag=True)
+    config = for_env(SNAKEBOARD, drag=True)
     parts = [*config.gaits.values(), config.ppo, config.evaluation]
     assert [part.env_kwargs for part in parts] == [{"drag": True}] * len(parts)
-    assert within(config) == for_env(SNAKEBOARD)
+    assert within(config) == dataclasses.replace(for_env(SNAKEBOARD), ppo=CONFIGS["Forward"].ppo)
+
+
+def test_a_mechanism_has_settings_of_its_own_where_no_drag_acts():
+    forward = CONFIGS["Forward"]
+    assert for_env(SNAKEBOARD).ppo == forward.ppo_of["snakeboard"] != forward.ppo
+    assert for_env(SNAKEBOARD, drag=True).ppo == dataclasses.replace(forward.ppo, env_kwargs={"drag": True})
+    assert for_env("nhenv/RollerRacerForward-v0").ppo == forward.ppo
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):
