@@ -43,6 +43,7 @@ def _drift(mechanism, steps, **arguments):
     return drift, slip
 
 
+@pytest.mark.slow
 def test_unforced_energy_over_ten_thousand_steps():
     """It walks at random: 20,000 roundings."""
     kept, slip = _drift("roller_racer", 10_000, keep_energy=True)

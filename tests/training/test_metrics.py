@@ -53,6 +53,7 @@ def test_every_metric_has_a_name_of_its_own_and_a_statistic():
     assert used == {metric.name for metric in METRICS}
 
 
+@pytest.mark.slow
 def test_speed_error_is_what_the_environment_itself_says():
     count, options = 4, {"whole_state": True}
     envs = gym.make_vec(SNAKEBOARD, count, info="final", **options)
