@@ -127,7 +127,7 @@ def test_stops_take_energy_and_give_none(env_id, bare):
 @pytest.mark.parametrize(
     ("env_id", "arguments"),
     [
-        (RACER, {"torque_limits": {"u_psi": 2.0}}),
+        pytest.param(RACER, {"torque_limits": {"u_psi": 2.0}}, marks=pytest.mark.slow),
         (SNAKEBOARD, {}),
         pytest.param(RACER, {"joint_limits": False}, marks=pytest.mark.slow),
     ],
