@@ -236,6 +236,10 @@ class Mechanism:
                 result[..., i, j] = evaluate(text, scope)
         return result[..., 0, :] if single else result
 
+    def direction(self, params: Mapping[str, float]) -> float:
+        """The way along x in which gaits drive it with these parameters: +1, -1, or 0 for neither."""
+        return float(np.sign(evaluate(self.forward, params)))
+
     def drag_coefficients(self, drag: bool | Mapping[str, float] | None) -> dict[str, float] | None:
         """Coefficients of the drag that acts, or None if none does: here, and nowhere else, this is decided.
 

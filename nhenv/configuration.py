@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mechanics.compiler.integrators import method
-from mechanics.expressions import evaluate, unknown_name
+from mechanics.expressions import unknown_name
 from mechanics.model import Model
 from nhenv import checks, tasks
 from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
@@ -108,7 +108,7 @@ class Configuration:
 
     def numbers(self, params: Mapping[str, float], drag: Mapping[str, float] | None) -> dict[str, float]:
         """A value for each of the scene's parameters, for these parameters and drag coefficients of the mechanism."""
-        forward = float(np.sign(evaluate(self.mechanism.forward, params)))
+        forward = self.mechanism.direction(params)
         if forward == 0:
             raise ValueError(
                 f"{self.mechanism.name}: with these parameters {self.mechanism.forward} = 0, and its gaits drive it "

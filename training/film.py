@@ -25,7 +25,6 @@ from rich.console import Console
 from rich.progress import track
 from scipy.spatial import cKDTree
 
-from mechanics.expressions import evaluate as value_of
 from nhenv import render
 from nhenv.canvas import Canvas
 from nhenv.vector_env import LocomotionVectorEnv
@@ -193,7 +192,7 @@ class _Strip:
 
     def __init__(self, takes: Sequence[Take], width: int) -> None:
         mechanism = takes[0].envs.mechanism
-        self._forward = float(np.sign(value_of(mechanism.forward, takes[0].envs.params)))
+        self._forward = mechanism.direction(takes[0].envs.params)
         self._x = mechanism.coordinates.index(mechanism.fibre[0])
         self._starts = [take.q[0, self._x] for take in takes]
         ways = [self._way(i, take.q) for i, take in enumerate(takes)]

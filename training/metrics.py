@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mechanics.expressions import evaluate as value_of
 from mechanics.expressions import names_in
 from mechanics.mechanism import Mechanism
 from mechanics.model import Model
@@ -141,7 +140,7 @@ def _along(envs: LocomotionVectorEnv) -> int:
 
 
 def _forward(envs: LocomotionVectorEnv) -> float:
-    return float(np.sign(value_of(envs.mechanism.forward, envs.params)))
+    return envs.mechanism.direction(envs.params)
 
 
 _ON_COMMAND = frozenset({"forward", "commanded_speed"})

@@ -32,7 +32,7 @@ class Observed:
         self.labels = (*mechanism.observation, *env.task.observation)
         units = [1 / evaluate(text, {label: 1.0}) for label, text in mechanism.observation.items()]
         self._units = np.array([*units, *[1.0] * len(env.task.observation)])
-        self.forward = float(np.sign(evaluate(mechanism.forward, env.params)))
+        self.forward = mechanism.direction(env.params)
 
     def values(self, observations: ArrayLike) -> Array:
         """Quantities (..., d) in observations (..., d)."""

@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mechanics.expressions import evaluate
 from mechanics.model import Model
 from nhenv.vector_env import LocomotionVectorEnv
 from training.evaluate import make_envs
@@ -83,7 +82,7 @@ class Shooting:
         self.start = np.zeros(mechanism.n) if start is None else np.array(start, dtype=float)
         self._n, self._size = mechanism.n, mechanism.n + mechanism.rank
         self._x, self.heading = (mechanism.coordinates.index(mechanism.fibre[i]) for i in (0, 2))
-        self._forward = float(np.sign(evaluate(mechanism.forward, envs.params)))
+        self._forward = mechanism.direction(envs.params)
         self._env = self._make(1)
         self.stops = np.full(mechanism.n, np.inf)
         for name, stop in envs.joint_limits.items():
