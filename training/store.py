@@ -33,9 +33,10 @@ __all__ = [
 _LIBRARIES = ("numpy", "scipy", "numba", "gymnasium", "torch", "stable_baselines3")
 
 
-def source_digest(file: str) -> str:
-    """Digest of a module's source. Taken on import, it is that of the code that runs."""
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+def source_digest(*files: str | Path) -> str:
+    """Digest of the source of one or several modules. Taken on import, it is that of the code that runs."""
+    each = (hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files)
+    return hashlib.sha256("".join(each).encode()).hexdigest()
 
 
 def settings(env_id: str, code: str, **config: Any) -> dict[str, Any]:
@@ -44,7 +45,7 @@ def settings(env_id: str, code: str, **config: Any) -> dict[str, Any]:
     Args:
         env_id: environment; its mechanism and task enter as the data that define them. What the engine does
             with these data is in the id's version.
-        code: digest of the module that makes the result; a change of it makes old results old.
+        code: digest of the modules that make the result; a change of them makes old results old.
         **config: settings, as numbers or frozen dataclasses.
     """
     spec = gym.spec(env_id)

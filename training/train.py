@@ -41,7 +41,9 @@ from training.wrappers import MovingStarts, ScaledReward
 
 __all__ = ["arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
-_CODE = source_digest(__file__)
+# Whatever a trained policy follows from here: what it learns in, and by what the best of the curve is chosen.
+_MODULES = ("train", "wrappers", "evaluate", "metrics")
+_CODE = source_digest(*(Path(__file__).with_name(f"{name}.py") for name in _MODULES))
 
 
 @dataclass(frozen=True)

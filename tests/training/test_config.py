@@ -6,6 +6,7 @@ import pytest
 
 import nhenv
 from nhenv import tasks
+from training import evaluate, metrics, train, wrappers
 from training.config import (
     COMPARED,
     CONFIGS,
@@ -23,8 +24,8 @@ from training.config import (
     training_seed,
     within,
 )
-from training.store import digest, piece_path, read_json, settings, write_bytes, write_json
-from training.train import ppo_path
+from training.store import digest, piece_path, read_json, settings, source_digest, write_bytes, write_json
+from training.train import ppo_path, ppo_settings
 from training.tuning import gait_path
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
@@ -83,6 +84,25 @@ def test_path_depends_on_seed_environment_and_code(tmp_path):
     assert len(paths) == 3
     assert digest(settings(SNAKEBOARD, "a")) != digest(settings(SNAKEBOARD, "b"))
     assert piece_path(tmp_path, settings(SNAKEBOARD, "a"), "x").parent == tmp_path / "SnakeboardForward-v0"
+
+
+def test_code_of_a_result_is_that_of_all_modules_from_which_it_follows():
+    made_of = source_digest(*(module.__file__ for module in (train, wrappers, evaluate, metrics)))
+    assert ppo_settings(SNAKEBOARD, PPOConfig(), 0)["code"] == made_of
+
+
+def test_digest_of_sources_changes_with_each_of_them(tmp_path):
+    files = [tmp_path / name for name in ("a.py", "b.py", "c.py")]
+    for file in files:
+        file.write_text(f"# {file.name}")
+    before = source_digest(*files)
+    assert source_digest(*map(str, files)) == before
+    for file in files:
+        text = file.read_text()
+        file.write_text(text + " changed")
+        assert source_digest(*files) != before
+        file.write_text(text)
+    assert source_digest(*files) == before
 
 
 def test_seeds_of_training_tuning_and_evaluation_never_meet():
