@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,14 @@ class MovingStarts(_Pickled):
         self._rng = np.random.default_rng([seed, 1])
         self._envs = envs
 
+    @cached_property
+    def _model(self) -> Model:
+        return Model(self._envs.mechanism, self._envs.params)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """As for every wrapper, and without the model, which is made again."""
+        return {name: value for name, value in super().__getstate__().items() if name != "_model"}
+
     def reset(self) -> NDArray[np.float32]:
         """Reset all rows."""
         return self._move(np.asarray(self.venv.reset()), np.ones(self.num_envs, bool))
@@ -104,8 +113,7 @@ class MovingStarts(_Pickled):
 
     def _states(self) -> tuple[Array, Array]:
         """Coordinates and velocities (N, n) of rows in motion."""
-        mechanism = self._envs.mechanism
-        model = Model(mechanism, self._envs.params)
+        mechanism, model = self._envs.mechanism, self._model
         coordinates, rows = mechanism.coordinates, self.num_envs
         q = np.zeros((rows, mechanism.n))
         q[:, coordinates.index(mechanism.fibre[2])] = self._rng.uniform(-np.pi, np.pi, rows)
