@@ -81,6 +81,15 @@ class Model:
         """Accelerations q̈ (..., n) that the rates and the constraints give."""
         return self._call("acceleration", *self._state(q, v), (u, len(self.mechanism.forces), "u"))
 
+    def controls_for(self, q: ArrayLike, v: ArrayLike, index: NDArray[np.intp], acceleration: Array) -> Array:
+        """Controls u (..., m) that give the coordinates at `index` (m,) accelerations (..., m)."""
+        m = len(self.mechanism.forces)
+        # Accelerations are affine in the controls: probe with none, then with one after another.
+        probe = np.vstack([np.zeros(m), np.eye(m)]).reshape(m + 1, *[1] * (np.ndim(q) - 1), m)
+        free, *response = self.acceleration(q, v, probe)[..., index]
+        matrix = np.stack(response, axis=-1) - free[..., None]
+        return np.linalg.solve(matrix, (acceleration - free)[..., None])[..., 0]
+
     def energy(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Kinetic plus potential energy in J, shape (...)."""
         return self._call("energy", *self._state(q, v))[..., 0]

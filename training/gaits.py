@@ -68,7 +68,8 @@ class Joints:
         q = np.zeros((*values.shape[:-1], n))
         for source, target in self._angles:
             q[..., target] = values[..., source]
-        frame = self.model.velocity(q, _stack(np.eye(k), q))  # (k, ..., n): one vector field a row
+        fields = np.eye(k).reshape(k, *[1] * (q.ndim - 1), k)
+        frame = self.model.velocity(q, fields)  # (k, ..., n): one vector field a row
         matrix = np.moveaxis(frame[..., self._moving], 0, -1)
         v = np.linalg.solve(matrix, values[..., self._rates, None])[..., 0]
         return q, v.astype(float, copy=False)
@@ -80,11 +81,7 @@ class Joints:
 
     def torque(self, q: Array, v: Array, acceleration: Array) -> Array:
         """Torques (..., m) in N m that give the joints these accelerations (..., m) in rad/s²."""
-        m = len(self.index)
-        trial = _stack(np.vstack([np.zeros(m), np.eye(m)]), q)
-        free, *response = self.model.acceleration(q, v, trial)[..., self.index]  # affine in the torque
-        matrix = np.stack(response, axis=-1) - free[..., None]
-        return np.linalg.solve(matrix, (acceleration - free)[..., None])[..., 0]
+        return self.model.controls_for(q, v, self.index, acceleration)
 
 
 @dataclass(frozen=True)
@@ -276,8 +273,3 @@ def torque_sinusoids(env: LocomotionEnv | LocomotionVectorEnv, config: TorqueCon
 
 def _ratio(joints: Joints, config: GaitConfig | TorqueConfig) -> Array:
     return np.where(joints.cyclic, config.cyclic_ratio, 1.0)
-
-
-def _stack(rows: Array, like: Array) -> Array:
-    """Rows (r, j) shaped (r, 1, ..., 1, j), to meet an array (..., n)."""
-    return rows.reshape(len(rows), *[1] * (like.ndim - 1), rows.shape[1])

@@ -70,20 +70,16 @@ def follow(
     model, joints = Model(mechanism, params), joint_index(mechanism)
     n, k, m = mechanism.n, mechanism.rank, len(joints)
     many = np.shape(shapes.amplitude)[:-1]
-    # No control, then one after another.
-    probe = np.vstack([np.zeros(m), np.eye(m)]).reshape(m + 1, *[1] * len(many), m)
 
     def rates(time: float, state: Array) -> Array:
         q, v = np.split(state.reshape(*many, n + k), [n], axis=-1)
-        # Accelerations are affine in the controls: those wanted are a linear system away.
-        free, *response = model.acceleration(q, v, probe)[..., joints]
-        matrix = np.stack(response, axis=-1) - free[..., None]
-        u = np.linalg.solve(matrix, (shapes.acceleration(time) - free)[..., None])[..., 0]
+        u = model.controls_for(q, v, joints, shapes.acceleration(time))
         return np.concatenate([model.velocity(q, v), model.rates(q, v, u)], axis=-1).ravel()
 
     q = np.zeros((*many, n))
     q[..., joints] = shapes.angle(0.0)
     still = np.zeros((*many, k))
+    probe = np.vstack([np.zeros(m), np.eye(m)]).reshape(m + 1, *[1] * len(many), m)  # none, then one after another
     unpushed, *pushed = model.rates(q, still, probe)
     push = np.stack(pushed, axis=-1) - unpushed[..., None]  # (..., k, m): Y, what impulses change v by
     frame = np.stack([model.velocity(q, still + column) for column in np.eye(k)], axis=-1)  # (..., n, k): X

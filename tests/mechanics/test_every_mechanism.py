@@ -59,6 +59,18 @@ def test_accelerations_are_those_of_the_multiplier_formulation(name, frame):
         np.testing.assert_allclose(model.project(q, qdot), v, rtol=0, atol=1e-12 * max(1.0, np.abs(v).max()))
 
 
+@pytest.mark.parametrize("name", ["snakeboard", "roller_racer", "differential_drive"])
+def test_controls_for_accelerations_give_them(name):
+    mechanism = MECHANISMS[name]
+    model, drawn = Model(mechanism, drag=True), [*random_states(mechanism, 6)]
+    index = np.array([row.index("1") for row in mechanism.forces.values()])  # torques on single joints, all of them
+    q, v, wanted = (np.array([state[i] for state in drawn]).reshape(2, 3, -1) for i in (1, 2, 3))
+    u = model.controls_for(q, v, index, wanted)
+    # Rounding of the products and of a linear system of condition 100.
+    np.testing.assert_allclose(model.acceleration(q, v, u)[..., index], wanted, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(model.controls_for(q[1, 2], v[1, 2], index, wanted[1, 2]), u[1, 2], rtol=1e-12)
+
+
 DRAGGED = [name for name, m in MECHANISMS.items() if m.rayleigh != "0"]
 
 
