@@ -41,6 +41,7 @@ __all__ = [
     "parse",
     "to_sympy",
     "unknown_name",
+    "wrong_keys",
 ]
 
 T = TypeVar("T")
@@ -98,6 +99,18 @@ def unknown_name(kind: str, given: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(given, known, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return f"unknown {kind} {_short(given)}; known: {', '.join(known) or 'none'}.{hint}"
+
+
+def wrong_keys(data: Mapping[Any, Any], known: Iterable[str], required: Iterable[str], what: str) -> str | None:
+    """Say what is wrong with the keys of plain data, `what` they are; None if nothing is."""
+    known = tuple(known)
+    for key in data:
+        if key not in known:
+            return f"{what}: {unknown_name('key', str(key), known)}"
+    for key in required:
+        if key not in data:
+            return f"{what} lacks {key!r}; it has {', '.join(map(str, data)) or 'nothing'}"
+    return None
 
 
 def check_name(name: str, kind: str) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from mechanics.bodies import Body
-from mechanics.expressions import ExpressionError, names_in, unknown_name
+from mechanics.expressions import ExpressionError, names_in, wrong_keys
 
 __all__ = ["Matrix", "MechanismError", "arguments", "matrix", "number", "read"]
 
@@ -66,12 +66,8 @@ def arguments(spec: Any) -> dict[str, Any]:
     """Arguments of `Mechanism` from a spec as described at `Mechanism.from_dict`."""
     if not isinstance(spec, Mapping):
         raise MechanismError(f"a mechanism's spec must be a mapping, not {type(spec).__name__}")
-    for key in spec:
-        if key not in _READERS:
-            raise MechanismError(f"in the mechanism's spec: {unknown_name('key', str(key), _READERS)}")
-    for key in _REQUIRED:
-        if key not in spec:
-            raise MechanismError(f"the mechanism's spec lacks {key!r}; it has {', '.join(spec)}")
+    if problem := wrong_keys(spec, _READERS, _REQUIRED, "the mechanism's spec"):
+        raise MechanismError(problem)
     result = {key: _READERS[key](value, key) for key, value in spec.items()}
     if "frame" in result:
         frames = result.get("frames", {})
@@ -148,12 +144,8 @@ def _table(entry: Callable[[Any, str], Any]) -> Callable[[Any, str], dict[str, A
 def _body(data: Any, what: str) -> Body:
     if not isinstance(data, Mapping):
         raise MechanismError(f"{what} must map {', '.join(_BODY)} to values, not {_show(data)}")
-    for key in data:
-        if key not in _BODY:
-            raise MechanismError(f"{what}: {unknown_name('key', str(key), _BODY)}")
-    for key in ("shape", "pose", "size"):
-        if key not in data:
-            raise MechanismError(f"{what} lacks {key!r}; it has {', '.join(map(str, data)) or 'nothing'}")
+    if problem := wrong_keys(data, _BODY, ("shape", "pose", "size"), what):
+        raise MechanismError(problem)
     return Body(**{key: _BODY[key](value, f"{what}, {key}") for key, value in data.items()})
 
 

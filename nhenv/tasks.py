@@ -27,7 +27,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name
+from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name, wrong_keys
 from mechanics.mechanism import Mechanism
 
 __all__ = ["MARKER", "POSE", "START", "TASKS", "Task", "get"]
@@ -94,13 +94,9 @@ class Task:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Task:
         """Build a task from plain data, such as `dataclasses.asdict` of one, or that read back from JSON."""
-        known = [f.name for f in fields(cls)]
-        for key in data:
-            if key not in known:
-                raise ValueError(f"in a task's data: {unknown_name('key', str(key), known)}")
-        for key in ("name", "reward", "max_episode_steps"):
-            if key not in data:
-                raise ValueError(f"a task's data lack {key!r}; they have {', '.join(map(str, data))}")
+        known, required = [f.name for f in fields(cls)], ("name", "reward", "max_episode_steps")
+        if problem := wrong_keys(data, known, required, "a task's spec"):
+            raise ValueError(problem)
         rules = {name: tuple(r) if isinstance(r, list) else r for name, r in data.get("targets", {}).items()}
         return cls(**{**data, "targets": rules})
 

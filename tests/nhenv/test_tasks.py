@@ -531,7 +531,7 @@ def test_impossible_tasks(change, words):
 
 @pytest.mark.parametrize("key", BASE)
 def test_tasks_that_lack_something(key):
-    with pytest.raises(ValueError, match=f"lack '{key}'"):
+    with pytest.raises(ValueError, match=f"lacks '{key}'"):
         Task.from_dict({name: value for name, value in BASE.items() if name != key})
 
 
