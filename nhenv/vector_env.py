@@ -272,6 +272,10 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         self._require_start()
         return {name: self._memory[f"t_{name}__p"] for name in self._kernel.TARGETS}
 
+    def marker(self, row: int) -> dict[str, float]:
+        """Where pictures show the target of a row's present episode: the numbers of the task's marker, by name."""
+        return self._configuration.marker({name: float(values[row]) for name, values in self.targets.items()})
+
     @property
     def elapsed_steps(self) -> NDArray[np.int64]:
         """Steps of each row since its reset, shape (N,)."""
@@ -374,10 +378,9 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
     def _begin_views(self, begun: Bools) -> None:
         """Tell the views of these rows that an episode begins."""
         if self._views:
-            q, targets = self.q, self.targets
+            q = self.q
             for i in np.flatnonzero(begun).tolist():
-                own = {name: values[i] for name, values in targets.items()}
-                self._views[i].begin(q[i], self._configuration.marker(own))
+                self._views[i].begin(q[i], self.marker(i))
 
     def _params_of(self, row: int) -> dict[str, float]:
         """Parameters of one row."""

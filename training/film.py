@@ -68,7 +68,7 @@ class Take:
     Attributes:
         label: whose it is.
         q: coordinates before each step and after the last, shape (T + 1, n).
-        marker: where the target is, as `nhenv.render.marker_of` has it.
+        marker: where the target is, as `LocomotionVectorEnv.marker` has it.
         envs: the environment.
     """
 
@@ -137,8 +137,7 @@ def record(actor: Actor, seed: int, **options: Any) -> Take:
     envs = gym.make_vec(actor.env_id, 1, whole_state=True, **{**actor.env_kwargs, **options})
     assert isinstance(envs, LocomotionVectorEnv)
     q = rollout(actor.make(envs), envs, [seed]).q[0]
-    numbers = {**envs.task.weights, **{name: float(values[0]) for name, values in envs.targets.items()}}
-    return Take(actor.label, q, render.marker_of(envs.task, numbers), envs)
+    return Take(actor.label, q, envs.marker(0), envs)
 
 
 def frames(

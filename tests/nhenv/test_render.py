@@ -360,6 +360,14 @@ def test_a_reset_begins_a_new_picture(make):
     np.testing.assert_array_equal(env.render(), first)
 
 
+def test_each_row_has_the_marker_of_its_own_target():
+    envs = gym.make_vec(GOAL, 2, backend="numpy", goal_radius=0.4).unwrapped
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.marker(0)
+    envs.reset(seed=0, options={"target": {"goal_x": np.array([3.0, -1.0]), "goal_y": 2.0}})
+    assert [envs.marker(row) for row in range(2)] == [{"x": x, "y": 2.0, "radius": 0.4} for x in (3.0, -1.0)]
+
+
 def test_pickled_environments_go_on_drawing(make, actions):
     env = make(RACER, **DRAWN)
     env.reset(seed=0)

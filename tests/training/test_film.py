@@ -60,6 +60,11 @@ def test_a_take_is_an_episode(take, goal):
     assert goal.marker == {"x": targets["goal_x"][0], "y": targets["goal_y"][0], "radius": 0.15}
 
 
+def test_a_take_shows_the_target_as_large_as_it_was():
+    take = record(random_actor(GOAL), 3, backend="numpy", max_episode_steps=2, goal_radius=0.4)
+    assert take.marker["radius"] == 0.4
+
+
 @pytest.mark.parametrize(("speed", "fps", "seconds", "count"), [(1, 20, None, 61), (2, 20, None, 31), (1, 10, 1.5, 16)])
 def test_a_film_lasts_as_long_as_what_it_shows(take, speed, fps, seconds, count):
     pictures = filmed(take, speed=speed, fps=fps, seconds=seconds)
