@@ -184,6 +184,54 @@ def _is_interval(rule: Any) -> bool:
     return math.isfinite(low) and math.isfinite(high) and low <= high
 
 
+# -- what tasks have in common that lead to a place, or to a place and a heading there -------------
+
+
+def _way_to(place: str) -> dict[str, str]:
+    """Definitions: the way to a place along x and y, and its length."""
+    return {
+        f"to_{place}_x": f"{place}_x - x",
+        f"to_{place}_y": f"{place}_y - y",
+        f"to_{place}": f"sqrt(to_{place}_x**2 + to_{place}_y**2)",
+    }
+
+
+def _ahead(place: str) -> str:
+    """The way to a place along the body."""
+    return f"cos(heading)*to_{place}_x + sin(heading)*to_{place}_y"
+
+
+def _left(place: str) -> str:
+    """The way to a place across the body."""
+    return f"cos(heading)*to_{place}_y - sin(heading)*to_{place}_x"
+
+
+def _way_to_pose(place: str) -> dict[str, str]:
+    """Definitions: the way to a place, and the angle in (-π, π] still to turn."""
+    return {**_way_to(place), "to_turn": "atan2(sin(target_heading - heading), cos(target_heading - heading))"}
+
+
+def _pose_seen(place: str) -> dict[str, str]:
+    """Observation of the way to a place in the body's axes, and of the angle still to turn."""
+    return {
+        f"{place}_ahead": _ahead(place),
+        f"{place}_left": _left(place),
+        "cos_to_turn": "cos(target_heading - heading)",
+        "sin_to_turn": "sin(target_heading - heading)",
+    }
+
+
+def _pose_info(place: str) -> dict[str, str]:
+    """Info: what is left of the way and of the angle, and 1 where both are within their tolerances."""
+    return {
+        "heading_error": "to_turn",
+        "offset": f"to_{place}",
+        "is_success": f"(1 + sign(heading_tolerance - abs(to_turn)))*(1 + sign(offset_tolerance - to_{place}))/4",
+    }
+
+
+# -- the tasks -------------------------------------------------------------------------------------
+
 TASKS: tuple[Task, ...] = (
     Task(
         name="Forward",
@@ -218,8 +266,8 @@ TASKS: tuple[Task, ...] = (
         name="Goal",
         observation={
             # The direction of the goal; a nanometre keeps it finite on the goal itself.
-            "goal_ahead": "(cos(heading)*to_goal_x + sin(heading)*to_goal_y)/(to_goal + 1e-9)",
-            "goal_left": "(cos(heading)*to_goal_y - sin(heading)*to_goal_x)/(to_goal + 1e-9)",
+            "goal_ahead": f"({_ahead('goal')})/(to_goal + 1e-9)",
+            "goal_left": f"({_left('goal')})/(to_goal + 1e-9)",
             "goal_distance": "to_goal/2",
         },
         reward={
@@ -242,11 +290,7 @@ TASKS: tuple[Task, ...] = (
             "goal_x": "x + start_distance*cos(heading + start_bearing)",
             "goal_y": "y + start_distance*sin(heading + start_bearing)",
         },
-        definitions={
-            "to_goal_x": "goal_x - x",
-            "to_goal_y": "goal_y - y",
-            "to_goal": "sqrt(to_goal_x**2 + to_goal_y**2)",
-        },
+        definitions=_way_to("goal"),
         terminated="goal_radius - to_goal",
         max_episode_steps=300,
         marker={"x": "goal_x", "y": "goal_y", "radius": "goal_radius"},
@@ -254,23 +298,14 @@ TASKS: tuple[Task, ...] = (
     # Paid for being there, not for the way: it is to turn, and to come to rest, on the spot.
     Task(
         name="Turn",
-        observation={
-            "start_ahead": "cos(heading)*to_start_x + sin(heading)*to_start_y",
-            "start_left": "cos(heading)*to_start_y - sin(heading)*to_start_x",
-            "cos_to_turn": "cos(target_heading - heading)",
-            "sin_to_turn": "sin(target_heading - heading)",
-        },
+        observation=_pose_seen("start"),
         reward={
             "reward_heading": "-heading_cost_weight*abs(to_turn)/pi",
             "reward_offset": "-offset_cost_weight*to_start",
             "reward_arrival": "arrival_reward_weight*exp(-(to_turn/heading_tolerance)**2)",
             "reward_ctrl": "-ctrl_cost_weight*effort",
         },
-        info={
-            "heading_error": "to_turn",
-            "offset": "to_start",
-            "is_success": "(1 + sign(heading_tolerance - abs(to_turn)))*(1 + sign(offset_tolerance - to_start))/4",
-        },
+        info=_pose_info("start"),
         weights={
             "heading_cost_weight": 1.0,
             "offset_cost_weight": 0.5,
@@ -286,12 +321,7 @@ TASKS: tuple[Task, ...] = (
             "start_x": "x",
             "start_y": "y",
         },
-        definitions={
-            "to_start_x": "start_x - x",
-            "to_start_y": "start_y - y",
-            "to_start": "sqrt(to_start_x**2 + to_start_y**2)",
-            "to_turn": "atan2(sin(target_heading - heading), cos(target_heading - heading))",
-        },
+        definitions=_way_to_pose("start"),
         max_episode_steps=160,
         any_pose=True,
         marker={"x": "start_x", "y": "start_y", "heading": "target_heading", "radius": "offset_tolerance"},
@@ -299,12 +329,7 @@ TASKS: tuple[Task, ...] = (
     # The heading counts near the place only; if it counted everywhere, doing nothing would be the best.
     Task(
         name="Park",
-        observation={
-            "place_ahead": "cos(heading)*to_place_x + sin(heading)*to_place_y",
-            "place_left": "cos(heading)*to_place_y - sin(heading)*to_place_x",
-            "cos_to_turn": "cos(target_heading - heading)",
-            "sin_to_turn": "sin(target_heading - heading)",
-        },
+        observation=_pose_seen("place"),
         reward={
             "reward_progress": "progress_reward_weight*(to_place_before - to_place)/dt",
             "reward_near": "near_reward_weight*exp(-(to_place/0.2)**2)"
@@ -313,11 +338,7 @@ TASKS: tuple[Task, ...] = (
             "*exp(-(to_place/offset_tolerance)**2 - (to_turn/heading_tolerance)**2)",
             "reward_ctrl": "-ctrl_cost_weight*effort",
         },
-        info={
-            "heading_error": "to_turn",
-            "offset": "to_place",
-            "is_success": "(1 + sign(heading_tolerance - abs(to_turn)))*(1 + sign(offset_tolerance - to_place))/4",
-        },
+        info=_pose_info("place"),
         weights={
             "progress_reward_weight": 1.0,
             "near_reward_weight": 1.0,
@@ -333,12 +354,7 @@ TASKS: tuple[Task, ...] = (
             "place_y": "y + sign(park_side)*park_size*cos(heading)",
             "target_heading": "heading",
         },
-        definitions={
-            "to_place_x": "place_x - x",
-            "to_place_y": "place_y - y",
-            "to_place": "sqrt(to_place_x**2 + to_place_y**2)",
-            "to_turn": "atan2(sin(target_heading - heading), cos(target_heading - heading))",
-        },
+        definitions=_way_to_pose("place"),
         max_episode_steps=240,
         any_pose=True,
         marker={"x": "place_x", "y": "place_y", "heading": "target_heading", "radius": "offset_tolerance"},
