@@ -237,11 +237,10 @@ class Generator:
         rules = task.targets if task else {}
         parts, lines = [], [f"_q_{name} = -_noise + (_noise + _noise)*_u{i}" for i, name in enumerate(noisy)]
         draw = len(noisy)
-        known = [_at_start(name).name for name in (task.start if task else ())]
+        known = [_at_start(role).name for role in self.scene.start]
         # Where an episode starts, unless that is given, is what was drawn, or else the origin.
-        places = dict(zip(START, self.scene.mechanism.fibre, strict=False))
-        for role, name in zip(task.start if task else (), known, strict=True):
-            drawn = f"_q_{places[role]}" if places[role] in noisy else "0.0"
+        for (role, coordinate), name in zip(self.scene.start.items(), known, strict=True):
+            drawn = f"_q_{coordinate}" if coordinate in noisy else "0.0"
             lines.append(f"{name} = either(_given_{role}, {drawn})")
         for name, rule in rules.items():
             if isinstance(rule, str):

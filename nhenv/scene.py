@@ -108,10 +108,15 @@ class Scene:
         return (*self.task.targets, *self.task.start) if self.task else ()
 
     @cached_property
+    def start(self) -> dict[str, str]:
+        """What of the pose at the start the targets need, of x, y and heading -> the coordinate that it is."""
+        roles = dict(zip(START, self.mechanism.fibre, strict=False))
+        return {name: roles[name] for name in (self.task.start if self.task else ())}
+
+    @cached_property
     def start_places(self) -> list[int]:
         """Coordinates that the last of `givable` are."""
-        roles = dict(zip(START, self.mechanism.fibre, strict=False))
-        return [self.mechanism.coordinates.index(roles[name]) for name in (self.task.start if self.task else ())]
+        return [self.mechanism.coordinates.index(name) for name in self.start.values()]
 
     @cached_property
     def draws(self) -> int:

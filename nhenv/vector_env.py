@@ -177,7 +177,7 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         # Nothing of the present episodes is changed before all is known to be right.
         streams = self._new_streams(seeds)
         q, v = self._state_given(options, mask, streams, given)
-        if "q" in options and q is not None:
+        if q is not None:
             given[mask, len(self.task.targets) :] = q[..., self._configuration.scene.start_places]
         self._kernel.begin_rows(self._memory.blocks, streams, self._numbers, mask, given)
         self._streams[:] = streams
