@@ -17,7 +17,7 @@ from training.evaluate import Rollout
 from training.metrics import headline, joint_index
 from training.store import write_bytes
 
-__all__ = ["GAITS", "POLICY", "Shown", "draw", "median_and_range"]
+__all__ = ["GAITS", "POLICY", "Shown", "draw", "mathtext", "median_and_range"]
 
 # Okabe and Ito's colours, which the colour-blind tell apart; line styles repeat what colours say.
 GAITS, POLICY = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#CC79A7", "#000000"), "#D55E00"
@@ -94,6 +94,11 @@ def draw(
     write_bytes(path, content.getvalue())
 
 
+def mathtext(name: str) -> str:
+    """Name in the notation of Matplotlib's formulas: u_psi is u with the index ψ."""
+    return "_".join(rf"\{part}" if part in GREEK else part for part in name.split("_"))
+
+
 def _height_of_paths(envs: LocomotionVectorEnv, shown: Sequence[Shown]) -> float:
     """Height in inches at which the paths fill the width of the figure, and a line of legend fits."""
     x, y, _ = (envs.mechanism.coordinates.index(name) for name in envs.mechanism.fibre)
@@ -154,7 +159,7 @@ def _angles(ax: Axes, envs: LocomotionVectorEnv, one: Shown) -> None:
     time, last = _window(envs, one)
     for i, joint in enumerate(joint_index(envs.mechanism)):
         name = envs.mechanism.coordinates[joint]
-        angle, label = one.episodes.q[0, last, joint], f"${_math(name)}$"
+        angle, label = one.episodes.q[0, last, joint], f"${mathtext(name)}$"
         if name not in envs.mechanism.joint_limits:  # a rotor may also turn steadily, which would dwarf the rest
             angle, label = angle - _drift(angle), f"{label}, drift removed"
         ax.plot(time, angle, color=JOINTS[i], ls=STYLES[i], label=label)
@@ -166,7 +171,7 @@ def _torques(ax: Axes, envs: LocomotionVectorEnv, one: Shown) -> None:
     time, last = _window(envs, one)
     for i, control in enumerate(envs.mechanism.controls):
         torque = one.episodes.torques[0, last[:-1], i]
-        ax.stairs(torque, time, baseline=None, color=JOINTS[i], ls=STYLES[i], lw=1.3, label=f"${_math(control)}$")
+        ax.stairs(torque, time, baseline=None, color=JOINTS[i], ls=STYLES[i], lw=1.3, label=f"${mathtext(control)}$")
     ax.set(xlabel="time (s)", ylabel="torque (N m)")
     _legend_above(ax)
 
@@ -176,11 +181,6 @@ def _legend_above(ax: Axes) -> None:
     low, high = ax.get_ylim()
     ax.set_ylim(low, high + 0.25 * (high - low))  # room for the legend
     ax.legend(handles, labels, loc="upper right", frameon=False, ncols=len(labels), borderaxespad=0)
-
-
-def _math(name: str) -> str:
-    """Name in the notation of Matplotlib's formulas: u_psi is u with the index ψ."""
-    return "_".join(rf"\{part}" if part in GREEK else part for part in name.split("_"))
 
 
 def _drift(values: np.ndarray) -> np.ndarray:

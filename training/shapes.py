@@ -23,7 +23,7 @@ from scipy.interpolate import CubicSpline
 from mechanics.geometry.local_connection import height_functions, shape_coordinates
 from training.config import EVALUATION_SEEDS
 from training.film import Take, actor, record
-from training.plots import GREEK
+from training.plots import mathtext
 from training.store import write_bytes
 
 __all__ = ["Shapes", "draw", "loops", "shapes"]
@@ -81,7 +81,7 @@ def draw(takes: Sequence[Take], title: str, first: float, last: float) -> bytes:
         ax = axes[portraits[i]]
         for k, (take, (r, rates)) in enumerate(zip(takes, moved, strict=True)):
             ax.plot(r[:, i], rates[:, i], color=COLOURS[k], ls=STYLES[k], lw=1.4, label=take.label)
-        ax.set(xlabel=_angle(mechanism.joint_limits, name), ylabel=f"$\\dot{{{_math(name)}}}$ (rad/s)")
+        ax.set(xlabel=_angle(mechanism.joint_limits, name), ylabel=f"$\\dot{{{mathtext(name)}}}$ (rad/s)")
         ax.grid(alpha=0.3)
         ax.spines[["top", "right"]].set_visible(False)
     handles, labels = axes[portraits[0]].get_legend_handles_labels()
@@ -121,12 +121,7 @@ def _heights(figure: Figure, axes: Sequence[Axes], takes: Sequence[Take], moved:
 
 def _angle(stops: object, name: str) -> str:
     drifting = "" if name in stops else ", drift removed"  # type: ignore[operator]
-    return f"${_math(name)}$ (rad{drifting})"
-
-
-def _math(name: str) -> str:
-    """Name in the notation of Matplotlib's formulas."""
-    return "_".join(rf"\{part}" if part in GREEK else part for part in name.split("_"))
+    return f"${mathtext(name)}$ (rad{drifting})"
 
 
 @dataclass(frozen=True, kw_only=True)
