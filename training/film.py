@@ -33,7 +33,7 @@ from training.evaluate import Controller, load_policy, rollout
 from training.store import read_json, write_bytes
 from training.tuning import controller, search_config
 
-__all__ = ["Actor", "Film", "Take", "actor", "film", "frames", "gif", "mp4", "random_actor", "record"]
+__all__ = ["Actor", "Film", "Take", "actor", "actors_of", "film", "frames", "gif", "mp4", "random_actor", "record"]
 
 Pixels = NDArray[np.uint8]
 
@@ -110,6 +110,15 @@ def actor(path: Path, label: str | None = None) -> Actor:
             name, make = read(path, settings, result)
             return Actor(label or name, settings["env_id"], settings[kind].get("env_kwargs", {}), make)
     raise ValueError(f"{beside} is of neither kind that can be filmed: {', '.join(_KINDS)}")
+
+
+def actors_of(pieces: Sequence[Path], labels: Sequence[str]) -> list[Actor]:
+    """Actors of files, which must be of one environment; the first of them are called by `labels`."""
+    actors = [actor(path, label) for path, label in itertools.zip_longest(pieces, labels[: len(pieces)])]
+    env_ids = dict.fromkeys(one.env_id for one in actors)
+    if len(env_ids) > 1:
+        raise ValueError(f"only controllers of one environment go together, not of {' and '.join(env_ids)}")
+    return actors
 
 
 _Read = tuple[str, Callable[[LocomotionVectorEnv], Controller]]
@@ -345,13 +354,10 @@ class Film:
 
     def actors(self) -> list[Actor]:
         """Who is filmed."""
-        labels = [*self.labels, *[None] * len(self.pieces)]
         if self.env_id is not None:
-            return [random_actor(self.env_id, next(iter(labels), None))]
-        actors = [actor(path, label) for path, label in zip(self.pieces, labels, strict=False)]
+            return [random_actor(self.env_id, next(iter(self.labels), None))]
+        actors = actors_of(self.pieces, self.labels)
         for other in actors[1:]:
-            if other.env_id != actors[0].env_id:
-                raise ValueError(f"a film is of one environment, not of {actors[0].env_id} and {other.env_id}")
             if self.drag is None and other.env_kwargs != actors[0].env_kwargs:
                 raise ValueError(
                     f"{actors[0].label} was made for {dict(actors[0].env_kwargs)}, {other.label} for "

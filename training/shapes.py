@@ -22,7 +22,7 @@ from scipy.interpolate import CubicSpline
 
 from mechanics.geometry.local_connection import height_functions, shape_coordinates
 from training.config import EVALUATION_SEEDS
-from training.film import Take, actor, record
+from training.film import Take, actors_of, record
 from training.plots import mathtext
 from training.store import write_bytes
 
@@ -155,10 +155,7 @@ class Shapes:
 
 def shapes(options: Shapes, console: Console) -> None:
     """Record, draw and write."""
-    labels = [*options.labels, *[None] * len(options.pieces)]
-    actors = [actor(path, label) for path, label in zip(options.pieces, labels, strict=False)]
-    if len({one.env_id for one in actors}) > 1:
-        raise ValueError(f"a figure is of one environment, not of {', '.join(sorted({one.env_id for one in actors}))}")
+    actors = actors_of(options.pieces, options.labels)
     with console.status("recording"):
         takes = [record(one, EVALUATION_SEEDS + options.seed) for one in actors]
     title = f"{actors[0].env_id.rpartition('/')[2]}, from {options.first:g} to {options.last:g} s"

@@ -62,13 +62,13 @@ def test_a_figure(take, monkeypatch):
 
 
 def test_the_command(take, tmp_path, monkeypatch):
-    monkeypatch.setattr(figures, "actor", lambda path, label: Named(str(path)))
+    monkeypatch.setattr("training.film.actor", lambda path, label: Named(str(path)))
     monkeypatch.setattr(figures, "record", lambda one, seed: dataclasses.replace(take, label=one.env_id))
     options = Shapes(pieces=("a", "a"), out=tmp_path / "shapes.png", first=2, last=8)
     shapes(options, Console(file=io.StringIO()))
     with Image.open(options.out) as image:
         assert image.width == 1350
-    with pytest.raises(ValueError, match="of one environment, not of a, b"):
+    with pytest.raises(ValueError, match="of one environment go together, not of a and b"):
         shapes(dataclasses.replace(options, pieces=("a", "b")), Console(file=io.StringIO()))
     with pytest.raises(ValueError, match="from 1 to 4 files can be drawn, got 0"):
         Shapes(pieces=())
