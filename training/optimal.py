@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -320,9 +321,10 @@ def main(options: Optimal) -> None:
     console = Console()
     jobs = []
     if not options.replay:
+        better = partial(improve, hops=options.hops, seed=options.seed, fresh=options.fresh, folder=options.out)
         for env_id, drag in options.cells:
             label = f"{env_id.rpartition('/')[2]}{', drag' if drag else ''}"
-            jobs.append(Job(label, _improve, (env_id, drag, options)))
+            jobs.append(Job(label, better, (env_id, drag)))
     try:
         run_jobs(jobs, options.processes, console)
     except KeyboardInterrupt:
@@ -330,12 +332,6 @@ def main(options: Optimal) -> None:
     with console.status("replaying"):
         table = _table(options)
     console.print(table)
-
-
-def _improve(env_id: str, drag: bool, options: Optimal, report: Report = ignore) -> None:
-    improve(
-        env_id, drag, hops=options.hops, seed=options.seed, fresh=options.fresh, folder=options.out, report=report
-    )  # fmt: skip
 
 
 if __name__ == "__main__":
