@@ -361,7 +361,7 @@ class Film:
             if self.drag is None and other.env_kwargs != actors[0].env_kwargs:
                 raise ValueError(
                     f"{actors[0].label} was made for {dict(actors[0].env_kwargs)}, {other.label} for "
-                    f"{dict(other.env_kwargs)}: say --drag or --no-drag"
+                    f"{dict(other.env_kwargs)}: say --drag True or --drag False"
                 )
         return actors
 

@@ -211,7 +211,7 @@ def test_impossible_films(tmp_path):
             Film(**options)
     for pieces, reason in (
         ((gait, other), f"not of {RACER} and {GOAL}"),
-        ((gait, dragged), "say --drag or --no-drag"),
+        ((gait, dragged), "say --drag True or --drag False"),
         ((tmp_path / "none.zip",), "there is no .*none.zip; training.compare writes"),
     ):
         with pytest.raises(ValueError, match=reason):

@@ -150,7 +150,8 @@ def test_interrupting_keeps_what_was_found(tmp_path):
         str(tmp_path),
         "--env-ids",
         RACER,
-        "--no-drag",
+        "--drag",
+        "False",
     ]
     process = subprocess.Popen([*command, "--hops", "10000"], stderr=subprocess.PIPE, text=True, start_new_session=True)
     path = path_of(RACER, False, tmp_path)
