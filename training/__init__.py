@@ -6,7 +6,7 @@ evaluate    the harness: one way to run a controller and to measure it
 statistics  interquartile means with intervals, over seeds and episodes
 gaits       sinusoidal gaits, by computed torque or as torques; they see what `observed` reads
 laws        laws in closed form that go farther, a file for each mechanism
-tuning      differential evolution of gaits and laws, which `family` makes of their settings
+tuning      gaits and laws tuned by differential `evolution`, which `family` makes of their settings
 predictions what theory says of gaits: with `prescribed` joints, and for fast torques by `averaging`
 optimal     the strongest known way forward: `climbing` by linear programs, `shooting` through the simulator
 train       PPO with Stable-Baselines3, checkpointed, in environments that `wrappers` change

@@ -29,11 +29,12 @@ import tyro
 from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.table import Table
-from scipy.optimize import Bounds, differential_evolution
+from scipy.optimize import Bounds
 
 from training.climbing import TRIALS, climb
 from training.config import COMPARED, check_env_id
 from training.evaluate import Controller, make_envs
+from training.evolution import evolve
 from training.progress import Job, Report, ignore, run_jobs
 from training.shooting import Shooting
 from training.store import read_json, versions, write_json
@@ -157,18 +158,8 @@ def _best_swings(env_id: str, drag: bool, seed: int, report: Report, generations
         report(rounds, generations + 1, "starts")
         return -total[:count]
 
-    result = differential_evolution(
-        loss,  # type: ignore[arg-type]  # the stubs forget that a vectorized function returns an array
-        Bounds(np.zeros(3 + 3 * m), np.ones(3 + 3 * m)),
-        popsize=size // (3 + 3 * m),
-        maxiter=generations,
-        rng=np.random.default_rng(seed),
-        vectorized=True,
-        updating="deferred",
-        polish=False,
-        tol=0,
-    )
-    return swings(result.x, steps)
+    bounds = Bounds(np.zeros(3 + 3 * m), np.ones(3 + 3 * m))
+    return swings(evolve(loss, bounds, population=size, generations=generations, seed=seed), steps)
 
 
 # -- the search ------------------------------------------------------------------------------------

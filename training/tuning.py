@@ -12,13 +12,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import differential_evolution
 
 from mechanics.expressions import unknown_name
 from nhenv.env import LocomotionEnv
 from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, GaitConfig, LawConfig, SearchConfig, TorqueConfig
 from training.evaluate import Controller, make_envs, rollout
+from training.evolution import evolve
 from training.family import Family
 from training.gaits import sinusoids, torque_sinusoids
 from training.laws import law_family
@@ -39,7 +39,7 @@ FAMILIES: dict[type[SearchConfig], Callable[[Env, Any, float], Family]] = {
 
 # Whatever a tuned vector follows from here; a change of one law makes all results old, which is on the safe side.
 _HERE = Path(__file__).parent
-_MODULES = ("tuning", "family", "gaits", "observed", "evaluate", "metrics")
+_MODULES = ("tuning", "evolution", "family", "gaits", "observed", "evaluate", "metrics")
 _CODE = source_digest(*(_HERE / f"{name}.py" for name in _MODULES), *sorted(_HERE.joinpath("laws").glob("*.py")))
 
 
@@ -100,18 +100,8 @@ def tune(env_id: str, config: SearchConfig, report: Report = ignore) -> Tuned:
         report(len(history), config.generations + 1, f"return {history[-1]:.0f}")
         return -means
 
-    result = differential_evolution(
-        loss,  # type: ignore[arg-type]  # the stubs forget that a vectorized function returns an array
-        searched.bounds,
-        popsize=max(1, config.population // len(searched.ranges)),
-        maxiter=config.generations,
-        rng=np.random.default_rng(config.seed),
-        vectorized=True,
-        updating="deferred",
-        polish=False,
-        tol=0,
-    )
-    vector = result.x.tolist()
+    best = evolve(loss, searched.bounds, population=config.population, generations=config.generations, seed=config.seed)
+    vector = best.tolist()
     return Tuned(vector, dict(zip(searched.ranges, vector, strict=True)), history, episodes)
 
 
