@@ -33,13 +33,13 @@ from scipy.optimize import Bounds
 
 from training.climbing import TRIALS, climb
 from training.config import COMPARED, check_env_id
-from training.evaluate import Controller, make_envs
+from training.evaluate import make_envs
 from training.evolution import evolve
 from training.progress import Job, Report, ignore, run_jobs
 from training.shooting import Shooting
 from training.store import read_json, versions, write_json
 
-__all__ = ["FOLDER", "Optimal", "Reference", "load", "path_of", "recorded", "reference", "replay", "search", "swings"]
+__all__ = ["FOLDER", "Optimal", "Reference", "load", "path_of", "reference", "replay", "search", "swings"]
 
 Array = NDArray[np.float64]
 
@@ -103,19 +103,6 @@ def reference(env_id: str, drag: bool | Mapping[str, float] | None = None) -> fl
 def replay(known: Reference, **env_kwargs: Any) -> float:
     """Metres that the actions reach in the environment, made with these further arguments."""
     return Shooting(known.env_id, drag=known.drag, **env_kwargs).distance(known.actions)
-
-
-def recorded(controller: Controller, env_id: str, drag: bool) -> NDArray[np.float32]:
-    """Actions (T, m) of a controller from where references begin: somewhere for a search to start."""
-    envs = make_envs(env_id, 1, drag=drag, whole_state=True)
-    controller.reset(1)
-    observations, _ = envs.reset(options={"q": np.zeros(envs.mechanism.n)})
-    actions, running = [], True
-    while running:
-        actions.append(np.clip(controller(observations)[0], -1, 1))
-        observations, _, terminated, truncated, _ = envs.step(actions[-1][None])
-        running = not (terminated[0] or truncated[0])
-    return np.array(actions, np.float32)
 
 
 # -- where to start --------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 from training import optimal
 from training.config import COMPARED
 from training.evaluate import make_envs
-from training.optimal import FOLDER, Optimal, Reference, improve, load, path_of, recorded, reference, replay, search
+from training.optimal import FOLDER, Optimal, Reference, improve, load, path_of, reference, replay, search
 
 CELLS = [(env_id, drag) for env_id in COMPARED for drag in (False, True)]
 SNAKEBOARD, RACER = COMPARED
@@ -78,28 +78,6 @@ def test_reference_survives_its_file_to_the_last_bit(tmp_path):
     assert again.actions.dtype == np.float32
     np.testing.assert_array_equal(again.actions, actions)
     assert (again.env_id, again.drag, again.distance_m, again.found) == (SNAKEBOARD, True, 1.5, {"x": 1})
-
-
-def test_controllers_are_recorded_as_they_are_replayed():
-    class Swing:
-        def reset(self, episodes):
-            self.steps = 0
-
-        def __call__(self, observations):
-            self.steps += 1
-            return np.full((1, 1), 3 * np.sin(self.steps / 3) - observations[0, 0], np.float32)
-
-    actions = recorded(Swing(), RACER, False)
-    assert actions.shape == (300, 1)
-    assert np.abs(actions).max() == 1
-    envs = make_envs(RACER, 1, whole_state=True)
-    swing = Swing()
-    swing.reset(1)
-    observations, _ = envs.reset(options={"q": np.zeros(4)})
-    for _ in range(300):
-        observations, *_ = envs.step(swing(observations))
-    known = Reference(env_id=RACER, drag=False, distance_m=0.0, actions=actions)
-    assert replay(known) == pytest.approx(-envs.q[0, 0], abs=1e-9)
 
 
 def test_search_only_ever_improves():
