@@ -1,3 +1,4 @@
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -84,8 +85,6 @@ def test_rewards_are_scaled_and_nothing_else():
 
 
 def test_other_environments_are_refused():
-    import gymnasium as gym
-
     envs = SyncVectorEnv([lambda: gym.make(SNAKEBOARD)], autoreset_mode=AutoresetMode.SAME_STEP)
     with pytest.raises(TypeError, match="only native environments can begin in motion"):
         MovingStarts(SB3VecEnv(envs), 1.0, 1, 0)
