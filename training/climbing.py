@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
-from training.evaluate import joint_index
+from training.metrics import joint_index
 from training.shooting import Linear, Shooting
 
 __all__ = ["TRIALS", "best_change", "climb", "pressed"]

@@ -21,7 +21,7 @@ from rich.table import Table
 from nhenv.vector_env import LocomotionVectorEnv
 from training import policies
 from training.config import EVALUATION_SEEDS, EvaluationConfig, check_env_id
-from training.metrics import joint_index, measure, metrics_of
+from training.metrics import measure, metrics_of
 from training.statistics import summary
 from training.store import read_json
 
@@ -33,10 +33,8 @@ __all__ = [
     "PolicyController",
     "Rollout",
     "evaluate",
-    "joint_index",
     "load_policy",
     "make_envs",
-    "measure",
     "origin",
     "recorded",
     "rollout",

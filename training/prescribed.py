@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.mechanism import Mechanism
 from mechanics.model import Model
-from training.evaluate import joint_index
+from training.metrics import joint_index
 
 __all__ = ["Sinusoids", "follow"]
 

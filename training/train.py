@@ -33,8 +33,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from nhenv.sb3 import make_sb3_vec_env
 from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
-from training.evaluate import PolicyController, measure, recorded, rollout
-from training.metrics import headline
+from training.evaluate import PolicyController, recorded, rollout
+from training.metrics import headline, measure
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
 from training.wrappers import MovingStarts, ScaledReward

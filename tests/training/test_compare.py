@@ -18,7 +18,8 @@ import training.evaluate
 from training import config
 from training.compare import Compare, compare, judge, strongest_known
 from training.config import EVALUATION_SEEDS, EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
-from training.evaluate import load_policy, make_envs, measure, recorded, rollout
+from training.evaluate import load_policy, make_envs, recorded, rollout
+from training.metrics import measure
 from training.optimal import reference
 from training.plots import median_and_range
 from training.progress import Job, run_jobs

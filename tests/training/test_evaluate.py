@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from training.config import COMPARED
-from training.evaluate import Evaluate, joint_index, make_envs, measure, rollout
+from training.evaluate import Evaluate, make_envs, rollout
+from training.metrics import joint_index, measure
 from training.store import write_json
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
