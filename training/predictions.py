@@ -317,7 +317,7 @@ def main() -> None:
     """Print the predictions beside the motions."""
     console = Console()
     for mechanism in dict.fromkeys(prediction.mechanism for prediction in PREDICTIONS.values()):
-        table = Table(title=f"{mechanism}, from rest")
+        table = Table(title=f"{mechanism}, from rest", pad_edge=False)  # to fit 80 columns
         for heading in ("gait", "", "predicted", "simulated", "error", "order"):
             table.add_column(heading, justify="left" if heading in ("gait", "") else "right", no_wrap=True)
         with console.status("integrating"):

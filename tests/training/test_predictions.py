@@ -8,7 +8,7 @@ import sympy as sp
 import mechanics
 from training import predictions
 from training.averaging import mean_acceleration
-from training.predictions import AVERAGING, PREDICTIONS, averaging, compare, main
+from training.predictions import AVERAGING, PREDICTIONS, Comparison, averaging, compare, main
 from training.prescribed import Sinusoids, follow
 
 EXACT = [name for name, prediction in PREDICTIONS.items() if prediction.order is None]
@@ -164,3 +164,16 @@ def test_the_command_prints_predictions_and_orders(capsys, monkeypatch):
     assert "rotate 2:1" in rotate
     assert "5: 4.99" in rotate
     assert "exact" in momentum
+
+
+def test_the_tables_fit_80_columns(capsys, monkeypatch):
+    scale = np.array([1.0, 0.5, 0.25])
+    widest = Comparison(scale, np.full(3, -7.10104), -7.10104 * (1 - 0.061 * scale**5))
+    monkeypatch.setattr(predictions, "compare", lambda prediction: widest)
+    monkeypatch.setattr(predictions, "averaging", lambda name: widest)
+    monkeypatch.setenv("COLUMNS", "80")
+    main()
+    printed = capsys.readouterr().out
+    assert printed.count(": 5.00") == sum(one.order is not None for one in PREDICTIONS.values()) + len(AVERAGING)
+    assert "…" not in printed
+    assert max(map(len, printed.splitlines())) <= 80
