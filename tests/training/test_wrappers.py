@@ -43,6 +43,17 @@ def test_first_episodes_begin_in_motion(env_id):
     assert np.abs(ahead).max() > 1
 
 
+def test_a_seed_has_starts_of_its_own():
+    def starts(seed):
+        envs = MovingStarts(make_sb3_vec_env(SNAKEBOARD, 3, seed=0, whole_state=True), ENERGY, 10**9, seed)
+        envs.reset()
+        return _inner(envs).q[:, 2], _inner(envs).energy
+
+    first, again, other = (starts(seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (np.array(first) != other).all()
+
+
 def test_ever_fewer_begin_in_motion_and_at_last_none():
     envs = _made(SNAKEBOARD, steps=ROWS * 900)
     envs.reset()
@@ -56,6 +67,21 @@ def test_ever_fewer_begin_in_motion_and_at_last_none():
     # Thrown like coins: a deviation of 0.025.
     assert shares[:2] == pytest.approx([2 / 3, 1 / 3], abs=0.08)
     assert shares[2:] == [0, 0]
+
+
+def test_rows_whose_episodes_go_on_do_so():
+    """Nothing drives them, so that they keep their energy, while others begin anew."""
+    envs = MovingStarts(make_sb3_vec_env(SNAKEBOARD, 50, seed=2, whole_state=True), ENERGY, 10**9, seed=3)
+    envs.reset()
+    inner, begun = _inner(envs), 0
+    for _ in range(40):
+        energy, elapsed = inner.energy, inner.elapsed_steps
+        _, _, dones, _ = envs.step(np.zeros((50, 2), np.float32))
+        np.testing.assert_allclose(inner.energy[~dones], energy[~dones], rtol=1e-6)  # 40 steps of 1e-10 each
+        assert (inner.elapsed_steps == np.where(dones, 0, elapsed + 1)).all()
+        assert (inner.energy[dones] != energy[dones]).all()
+        begun += dones.sum()
+    assert begun > 2
 
 
 def test_a_row_at_rest_is_left_alone():
