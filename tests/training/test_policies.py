@@ -1,6 +1,8 @@
 import hashlib
+import io
 import json
 import os
+import pickle
 import re
 import struct
 import subprocess
@@ -145,11 +147,52 @@ print(policy(np.zeros(6)).shape, *{{name.partition(".")[0] for name in sys.modul
     assert {"numpy", "safetensors"} <= set(loaded)
 
 
-def test_loading_executes_nothing(exported, tmp_path, monkeypatch):
-    """No pickle is ever opened, which an unpickler that complains proves."""
-    monkeypatch.setattr("pickle.load", lambda *arguments: pytest.fail("it unpickles"))
-    monkeypatch.setattr("pickle.loads", lambda *arguments: pytest.fail("it unpickles"))
-    load(exported)
+class Trap:
+    """Something that leaves a file behind when it is unpickled."""
+
+    def __init__(self, trace):
+        self.trace = trace
+
+    def __reduce__(self):
+        return Path.touch, (self.trace,)
+
+
+def saved(trap, save):
+    """What a function writes of it into a file, as bytes."""
+    file = io.BytesIO()
+    save(file, trap)
+    return file.getvalue()
+
+
+PICKLING = {
+    "pickle": lambda file, trap: pickle.dump(trap, file),
+    "torch": lambda file, trap: torch.save(trap, file),
+    "numpy": lambda file, trap: np.save(file, np.array([trap], object)),
+}
+OPENING = {
+    "pickle": pickle.load,
+    "torch": lambda file: torch.load(file, weights_only=False),
+    "numpy": lambda file: np.load(file, allow_pickle=True),
+}
+
+
+@pytest.mark.parametrize("kind", PICKLING)
+def test_loading_executes_nothing(exported, tmp_path, kind):
+    trace, path = tmp_path / "trace", tmp_path / exported.name
+    trap = saved(Trap(trace), PICKLING[kind])
+    OPENING[kind](io.BytesIO(trap))
+    assert trace.exists()  # so does whoever opens it
+    trace.unlink()
+    beside, card = path.with_suffix(".json"), read_json(exported.with_suffix(".json"))
+    path.write_bytes(trap)
+    write_json(beside, card | {"sha256": hashlib.sha256(trap).hexdigest()})
+    with pytest.raises(PolicyError, match="not in the format safetensors"):
+        load(path)
+    path.write_bytes(exported.read_bytes())
+    beside.write_bytes(trap)
+    with pytest.raises(PolicyError, match="is not JSON"):
+        load(path)
+    assert not trace.exists()
 
 
 def test_shipped_policies_are_found_by_name(exported, monkeypatch):
