@@ -153,11 +153,12 @@ def make_envs_to_learn_in(env_id: str, config: PPOConfig, seed: int) -> VecEnv:
 
 
 def _compile(envs: LocomotionVectorEnv, env_id: str, config: PPOConfig) -> None:
-    """Have the kernels made, of these environments and of those in which the policy learns, if they are not cached."""
+    """Have the code made of these environments and of those in which the policy learns, if it is not cached."""
     controls = len(envs.mechanism.controls)
     envs.reset()
     envs.step(np.zeros((envs.num_envs, controls), np.float32))
-    learning = make_sb3_vec_env(env_id, 1, **config.env_kwargs)  # others of its kind: a reset would use up the seeds
+    # Others of its kind: a reset would use up the seeds.
+    learning = make_envs_to_learn_in(env_id, dataclasses.replace(config, n_envs=1), 0)
     learning.reset()
     learning.step(np.zeros((1, controls), np.float32))
 

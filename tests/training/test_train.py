@@ -7,6 +7,7 @@ import pytest
 import torch
 from gymnasium.error import DependencyNotInstalled
 
+from mechanics.compiler import kernels
 from training.config import TUNING_SEEDS, PPOConfig
 from training.evaluate import load_policy, make_envs, rollout
 from training.progress import Interrupted, ignore
@@ -168,6 +169,22 @@ def test_first_episodes_end_out_of_phase_and_later_ones_do_not():
     assert len(set(first)) == count
     assert all(1 <= time <= 300 for time in first)
     assert all(times[1] - times[0] == 300 for times in ends)
+
+
+def compiled():
+    """What is loaded of generated code, and how often each of its functions was compiled."""
+    functions = ((key, name, f) for key, module in kernels._loaded.items() for name, f in vars(module).items())
+    return {(key, name): len(getattr(f, "signatures", ())) for key, name, f in functions if callable(f)}
+
+
+def test_nothing_is_derived_or_compiled_once_the_clock_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "_loaded", {})  # as in a process that has only begun
+    seen = []
+    monkeypatch.setattr("training.train.make_model", lambda *given: seen.append(compiled()) or make_model(*given))
+    train_piece(SNAKEBOARD, dataclasses.replace(TINY, timesteps=128), 0, tmp_path)
+    (before,) = seen
+    assert sum(before.values()) > 0
+    assert compiled() == before
 
 
 def test_seconds_of_a_run_do_not_count_compilation(tmp_path, monkeypatch):
