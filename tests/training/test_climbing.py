@@ -1,7 +1,10 @@
+import itertools
+
 import numpy as np
 import pytest
 
-from training.climbing import ANGLE, TRIALS, best_change, climb, pressed
+from training import climbing
+from training.climbing import ANGLE, TRIALS, WINDOW, best_change, climb, pressed
 from training.config import COMPARED
 from training.shooting import Shooting
 
@@ -61,6 +64,34 @@ def test_climbs_never_lose(board):
     assert np.abs(actions).max() <= 1
 
 
+def test_a_small_step_gains_what_its_linear_program_promises(board, monkeypatch):
+    monkeypatch.setattr(climbing, "FIRST_RADIUS", 1e-4)
+    start = swinging(board.shape)
+    _, promised = best_change(board, *board.linear(start), start, 1e-4)
+    distance, _ = climb(board, start, 1)
+    assert distance - board.distance(start) == pytest.approx(promised, rel=0.05)
+
+
+def test_what_gains_nothing_is_not_done(board, monkeypatch):
+    monkeypatch.setattr(board, "distances", lambda trials: np.full(len(trials), -100.0))
+    start = swinging(board.shape)
+    heard = []
+    distance, actions = climb(board, start, 60, heard=heard.append)
+    np.testing.assert_array_equal(actions, start)
+    assert distance == board.distance(start)
+    # The trust region shrinks to a 64th each time, from 0.3 to less than 1e-5.
+    assert len(heard) == 3
+
+
+def test_a_climb_ends_where_little_is_gained(board, monkeypatch):
+    reached = itertools.count(0.0, 1e-4)
+    monkeypatch.setattr(board, "distances", lambda trials: np.full(len(trials), 1.0))
+    monkeypatch.setattr(board, "distance", lambda actions: next(reached))
+    heard = []
+    climb(board, swinging(board.shape), 60, heard=heard.append)
+    assert len(heard) == WINDOW
+
+
 def test_joints_that_rest_on_their_stops_are_pressed_there(board):
     actions = np.zeros(board.shape)
     actions[:40, 1] = 0.1  # the steering reaches its stop within these 2 s
@@ -71,6 +102,27 @@ def test_joints_that_rest_on_their_stops_are_pressed_there(board):
     assert (harder[40:59, 1] == 1).all()
     assert harder[0, 1] == 0.1
     np.testing.assert_allclose(board.states(harder), board.states(actions), rtol=0, atol=1e-8)
+
+
+def test_a_climb_begins_within_the_limits_and_pressed(board):
+    actions = np.zeros(board.shape)
+    actions[:, 0] = -5
+    actions[:60, 1] = 0.1
+    _, begun = climb(board, actions, 0)
+    assert (begun[:, 0] == -1).all()
+    assert (begun[50:59, 1] == 1).all()
+
+
+def test_what_a_climb_has_loosened_is_pressed_again(board, monkeypatch):
+    actions = np.zeros(board.shape)
+    actions[:40, 1] = 0.1
+    actions[40:60, 1] = 1.0
+    loosened = np.zeros(board.shape)
+    loosened[45:55, 1] = -0.5
+    monkeypatch.setattr(climbing, "best_change", lambda *given: (loosened, 0.0))
+    monkeypatch.setattr(board, "distances", lambda trials: np.full(len(trials), 100.0))
+    _, climbed = climb(board, actions, 1)
+    assert (climbed[45:55, 1] == 1).all()
 
 
 def test_mirrored_actions_are_pressed_to_the_other_stop(board):

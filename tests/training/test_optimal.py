@@ -1,3 +1,4 @@
+import dataclasses
 import os
 import signal
 import subprocess
@@ -91,6 +92,18 @@ def test_search_only_ever_improves():
     assert replay(again) == pytest.approx(distance, abs=1e-9)
 
 
+def test_a_climb_that_ends_lower_is_forgotten(monkeypatch):
+    tried, known = [], load(RACER, False)
+    monkeypatch.setattr(optimal, "climb", lambda shooting, trial, rounds: (tried.append(trial), 0 * trial))
+    distance, actions = search(RACER, False, known.actions, hops=2, found=lambda *what: pytest.fail("it is no gain"))
+    np.testing.assert_array_equal(actions, known.actions)
+    assert distance == pytest.approx(known.distance_m, abs=1e-3)
+    # The first climb is from what was given, the others from what a change has made of it.
+    np.testing.assert_array_equal(tried[0], known.actions)
+    assert [(trial != known.actions).any() for trial in tried] == [False, True, True]
+    assert all((trial == known.actions).any() and np.abs(trial).max() <= 1 for trial in tried)
+
+
 def test_swings_hold_then_swing():
     numbers = np.array([0.25, 0.5, 0.5, 1.0, 0.0, 0.5, 0.1, 0.0, 0.25])  # share, two frequencies, two of each kind
     actions = optimal.swings(numbers, 300)
@@ -101,6 +114,16 @@ def test_swings_hold_then_swing():
     np.testing.assert_array_equal(optimal.swings(np.stack([numbers, numbers]), 300)[1], actions)
 
 
+def test_swings_grow_faster_or_slower():
+    # Of 60 swings an episode a tenth at first and three tenths at last, over three quarters of it: nine.
+    held, *swinging = np.split(optimal.swings(np.array([0.25, 0.1, 0.3, 0.6, 0.25, 0.1]), 300)[:, 0], [75, 150])
+    assert held == pytest.approx(0.4)
+    assert np.abs(np.concatenate(swinging)).max() == pytest.approx(0.5, abs=0.01)
+    early, late = (np.count_nonzero(np.diff(np.sign(half))) / 2 for half in (swinging[0], swinging[1]))
+    assert early == pytest.approx(60 * (0.1 * 0.25 + 0.2 * 0.25**2 / 2 / 0.75), abs=0.5)
+    assert early + late == pytest.approx(9, abs=0.5)
+
+
 def test_what_is_known_is_only_replaced_by_better(tmp_path):
     path = path_of(RACER, False, tmp_path)
     load(RACER, False).write(path)
@@ -108,6 +131,20 @@ def test_what_is_known_is_only_replaced_by_better(tmp_path):
     improve(RACER, False, hops=1, seed=0, fresh=False, folder=tmp_path)
     after = Reference.read(path)
     assert path.read_bytes() == before or after.distance_m > reference(RACER, False)
+
+
+def test_a_fresh_search_begins_with_what_the_folder_holds_or_with_swings(tmp_path, monkeypatch):
+    begun = []
+    monkeypatch.setattr(optimal, "search", lambda env_id, drag, start, **others: begun.append(np.asarray(start)))
+    monkeypatch.setattr(optimal, "_best_swings", lambda *given: np.full((300, 1), 0.5))
+    for fresh in (True, False):
+        improve(RACER, False, hops=1, seed=0, fresh=fresh, folder=tmp_path)
+    own = dataclasses.replace(load(RACER, False), actions=np.full((300, 1), 0.25, np.float32))
+    own.write(path_of(RACER, False, tmp_path))
+    for fresh in (True, False):
+        improve(RACER, False, hops=1, seed=0, fresh=fresh, folder=tmp_path)
+    for start, expected in zip(begun, (0.5, load(RACER, False).actions, 0.25, 0.25), strict=True):
+        np.testing.assert_array_equal(start, np.broadcast_to(expected, (300, 1)))
 
 
 def test_impossible_options_are_refused():

@@ -55,6 +55,21 @@ def test_gradient_is_that_of_whole_episodes(env_id, shooting):
 
 
 @every_environment
+def test_gradient_of_the_last_hold_is_what_it_covers_itself(env_id, shooting):
+    """Little beside what early actions do, and lost in the sum over all of them."""
+    one = shooting(env_id)
+    actions = actions_of(one.shape, 0.8)
+    gradient = one.linear(actions)[1].gradient()[-1]
+    for control in range(one.shape[1]):
+        step = np.zeros(one.shape)
+        step[-1, control] = 1e-2
+        ahead, behind = one.distances(actions + np.array([step, -step]))
+        # What is left of the third order; derivatives of single holds have noise of 1e-10 / STEP.
+        assert gradient[control] == pytest.approx((ahead - behind) / 2e-2, rel=1e-2, abs=2e-5)
+    assert np.abs(gradient).max() > 1e-4
+
+
+@every_environment
 def test_gradient_at_a_limit_is_that_towards_the_inside(env_id, shooting):
     one = shooting(env_id)
     actions = np.sign(actions_of(one.shape, 1.0))
@@ -82,7 +97,9 @@ def test_trials_are_what_each_would_be_alone(shooting):
 
 
 def test_episodes_begin_where_they_are_told(shooting):
-    elsewhere = Shooting(COMPARED[1], start=[1.0, 2.0, 0.0, 0.3])
+    elsewhere, aside = (Shooting(COMPARED[1], start=[x, 2 * x, 0.0, 0.3]) for x in (1.0, 0.0))
     actions = actions_of(elsewhere.shape, 0.8)
     assert elsewhere.states(actions)[0, :4].tolist() == [1.0, 2.0, 0.0, 0.3]
     assert elsewhere.distance(actions) != pytest.approx(shooting(COMPARED[1]).distance(actions), abs=1e-3)
+    # Where in the plane makes no difference to how far; the integrator's error is of the size of its numbers.
+    assert elsewhere.distance(actions) == pytest.approx(aside.distance(actions), abs=1e-8)
