@@ -221,6 +221,11 @@ def _pose_seen(place: str) -> dict[str, str]:
     }
 
 
+def _arrival(place: str) -> str:
+    """Reward for being at a place and turned as asked."""
+    return f"arrival_reward_weight*exp(-(to_{place}/offset_tolerance)**2 - (to_turn/heading_tolerance)**2)"
+
+
 def _pose_info(place: str) -> dict[str, str]:
     """Info: what is left of the way and of the angle, and 1 where both are within their tolerances."""
     return {
@@ -302,7 +307,7 @@ TASKS: tuple[Task, ...] = (
         reward={
             "reward_heading": "-heading_cost_weight*abs(to_turn)/pi",
             "reward_offset": "-offset_cost_weight*to_start",
-            "reward_arrival": "arrival_reward_weight*exp(-(to_turn/heading_tolerance)**2)",
+            "reward_arrival": _arrival("start"),
             "reward_ctrl": "-ctrl_cost_weight*effort",
         },
         info=_pose_info("start"),
@@ -334,8 +339,7 @@ TASKS: tuple[Task, ...] = (
             "reward_progress": "progress_reward_weight*(to_place_before - to_place)/dt",
             "reward_near": "near_reward_weight*exp(-(to_place/0.2)**2)"
             "*(0.25 + 0.75*((1 + cos(target_heading - heading))/2)**2)",
-            "reward_arrival": "arrival_reward_weight"
-            "*exp(-(to_place/offset_tolerance)**2 - (to_turn/heading_tolerance)**2)",
+            "reward_arrival": _arrival("place"),
             "reward_ctrl": "-ctrl_cost_weight*effort",
         },
         info=_pose_info("place"),
