@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -161,11 +162,12 @@ class PPOConfig:
         gae_lambda: λ of the generalized advantage estimate.
         clip_range: clip of the probability ratio.
         target_kl: an update stops early above 1.5 times this divergence.
-        entropy: weight of the policy's entropy.
+        entropy: weight of the policy's entropy, at the beginning and at the end, linear in between.
         log_std: initial logarithm of the policy's standard deviation, in actions.
         reward_scale: what rewards are multiplied by. Value function and policy share a limit on the gradient, and
             returns of hundreds leave nothing of it to the policy.
         start_energy: J; episodes begin in motion, with up to this much, ever fewer of them; 0 for none.
+        start_offset: m; these begin up to this far, along x and along y, from where their targets are drawn.
         start_share: part of the training after which all begin at rest; beyond 1, some always begin in motion.
         hidden: units of each tanh layer; policy and value function share none.
         curve_every: updates between two points of the learning curve.
@@ -180,14 +182,15 @@ class PPOConfig:
     batch_size: int = 1024
     n_epochs: int = 10
     learning_rate: tuple[float, float] = (3e-3, 3e-4)
-    gamma: float = 0.99
+    gamma: float = 0.999
     gae_lambda: float = 0.95
     clip_range: float = 0.2
     target_kl: float = 0.03
-    entropy: float = 0.0
+    entropy: tuple[float, float] = (0.0, 0.0)
     log_std: float = 0.0
     reward_scale: float = 1.0
     start_energy: float = 0.0
+    start_offset: float = 0.0
     start_share: float = 0.8
     hidden: tuple[int, ...] = (64, 64)
     curve_every: int = 10
@@ -218,7 +221,7 @@ class TaskConfig:
     Attributes:
         gaits: by name, with equal budgets; each where it fits the mechanism. The first is drawn beside the policy.
         ppo: what trains the policy.
-        ppo_of: mechanism -> what trains its policy instead, where no drag acts.
+        ppo_of: mechanism, or mechanism and ", drag" where its drag acts -> what trains its policy instead.
         evaluation: what judges both.
     """
 
@@ -238,39 +241,57 @@ class TaskConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
+# Targets differ more than starts at rest do: it takes more of them to tell who is better.
+_JUDGED_OFTEN = EvaluationConfig(episodes=1000)
+_VARIED = PPOConfig(
+    timesteps=2_000_000, gamma=0.99, reward_scale=0.1, entropy=(0.01, 0.0), start_energy=4.0, curve_episodes=64
+)
+_gait = partial(GaitConfig, starts=16)
+
 CONFIGS: dict[str, TaskConfig] = {
     "Forward": TaskConfig(
-        ppo=PPOConfig(reward_scale=0.05),
-        # Without drag its momentum lasts: a policy has to look seconds ahead to see that it pays to charge first.
+        ppo=PPOConfig(reward_scale=0.05, entropy=(0.02, 0.0)),
+        # What lasts longer is worth more: without drag rewards and energies are larger.
         ppo_of={
-            "snakeboard": PPOConfig(reward_scale=0.02, gamma=0.996, entropy=0.003, start_energy=150.0, start_share=1.25)
+            "snakeboard": PPOConfig(reward_scale=0.02, entropy=(0.02, 0.0), start_energy=150.0),
+            "snakeboard, drag": PPOConfig(reward_scale=0.05, entropy=(0.02, 0.0), start_energy=30.0),
+            "roller_racer": PPOConfig(timesteps=1_500_000, reward_scale=0.02, entropy=(0.02, 0.0), start_energy=20.0),
+            "roller_racer, drag": PPOConfig(reward_scale=0.05, entropy=(0.06, 0.0), start_energy=8.0),
         },
     ),
     "Velocity": TaskConfig(
         # The more speed is missing, the larger the swing; a joint that swings the other way brakes.
         gaits={
-            "sinusoid": GaitConfig(limited_by="commanded_speed - forward*speed"),
-            "steered sinusoid": GaitConfig(steered=True, limited_by="commanded_speed - forward*speed"),
-        }
+            "sinusoid": _gait(limited_by="commanded_speed - forward*speed"),
+            "steered sinusoid": _gait(steered=True, limited_by="commanded_speed - forward*speed"),
+        },
+        ppo=dataclasses.replace(_VARIED, reward_scale=0.05),
+        evaluation=_JUDGED_OFTEN,
     ),
     "Goal": TaskConfig(
         gaits={
-            "steered sinusoid": GaitConfig(steered=True, steered_by="atan2(forward*goal_left, forward*goal_ahead)"),
+            "steered sinusoid": _gait(steered=True, steered_by="atan2(forward*goal_left, forward*goal_ahead)"),
             # To a goal behind it goes backwards, if the mechanism can.
-            "steered either way": GaitConfig(steered=True, steered_by="goal_left", limited_by="goal_ahead"),
-        }
+            "steered either way": _gait(steered=True, steered_by="goal_left", limited_by="goal_ahead"),
+        },
+        ppo=_VARIED,
+        evaluation=_JUDGED_OFTEN,
     ),
     # Ostrowski's gaits: what is left to turn, or to go sideways, decides how large they are and which way they work.
     "Turn": TaskConfig(
-        gaits={"sinusoid 2:1": GaitConfig(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")}
+        gaits={"sinusoid 2:1": _gait(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")},
+        ppo=dataclasses.replace(_VARIED, timesteps=3_000_000, entropy=(0.02, 0.0), start_offset=0.3),
+        evaluation=_JUDGED_OFTEN,
     ),
     "Park": TaskConfig(
         gaits={
-            "sinusoid 3:2": GaitConfig(cyclic_ratio=1.5, limited_by="place_left", gain=20.0),
-            "steered sinusoid 3:2": GaitConfig(
+            "sinusoid 3:2": _gait(cyclic_ratio=1.5, limited_by="place_left", gain=20.0),
+            "steered sinusoid 3:2": _gait(
                 cyclic_ratio=1.5, limited_by="place_left", gain=20.0, steered=True, steered_by="sin_to_turn"
             ),
-        }
+        },
+        ppo=dataclasses.replace(_VARIED, reward_scale=0.05, start_offset=0.3),
+        evaluation=_JUDGED_OFTEN,
     ),
 }
 
@@ -316,7 +337,7 @@ def for_env(env_id: str, drag: bool = False) -> TaskConfig:
     config = CONFIGS[task_name(check_env_id(env_id))]
     mechanism = as_mechanism(gym.spec(env_id).kwargs["mechanism"]).name
     gaits = {name: gait for name, gait in config.gaits.items() if gait.fits(mechanism)}
-    ppo = config.ppo if drag else config.ppo_of.get(mechanism, config.ppo)
+    ppo = config.ppo_of.get(f"{mechanism}, drag" if drag else mechanism, config.ppo)
     config = dataclasses.replace(config, gaits=gaits, ppo=ppo)
     return within(config, drag=True) if drag else config
 

@@ -26,9 +26,10 @@ FILE = Path(__file__).with_name("rl_zoo.yml")
 
 HEADER = """\
 # PPO for the environments of nhenv, in the format of RL Baselines3 Zoo. Written by `python -m training.rl_zoo`;
-# do not edit. What the format cannot say: learning rates fall to zero there, here to {last}; here first
-# episodes have random lengths, some begin in motion, rewards are scaled, the best policy of the learning curve is
-# kept, and all environments are stepped by one call.
+# do not edit. What the format cannot say: learning rates fall to zero there, here to {last}; the weight of the
+# entropy falls to zero here; here the value function sees how much of an episode is over, and the time limit is an
+# end; without that a smaller gamma may do better. First episodes have random lengths here, some begin in motion,
+# rewards are scaled, the best policy of the learning curve is kept, and all environments are stepped by one call.
 """
 
 

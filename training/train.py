@@ -37,12 +37,13 @@ from training.evaluate import PolicyController, recorded, rollout
 from training.metrics import headline, measure
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
-from training.wrappers import MovingStarts, ScaledReward
+from training.time_aware import TimeAwareCritic
+from training.wrappers import Clock, MovingStarts, ScaledReward
 
 __all__ = ["arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
 # Whatever a trained policy follows from here: what it learns in, and by what the best of the curve is chosen.
-_MODULES = ("train", "wrappers", "evaluate", "metrics")
+_MODULES = ("train", "wrappers", "time_aware", "evaluate", "metrics")
 _CODE = source_digest(*(Path(__file__).with_name(f"{name}.py") for name in _MODULES))
 
 
@@ -91,6 +92,8 @@ class Run(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         steps = self.model.num_timesteps
+        assert isinstance(self.model, PPO)
+        self.model.ent_coef = Linear(*self.config.entropy)(1 - min(1, steps / self.config.timesteps))
         updates = steps // (self.config.n_envs * self.config.n_steps)
         if updates % self.config.curve_every == 0 and not (self.curve and self.curve[-1]["steps"] == steps):
             self.draw()
@@ -143,13 +146,13 @@ class Run(BaseCallback):
 
 
 def make_envs_to_learn_in(env_id: str, config: PPOConfig, seed: int) -> VecEnv:
-    """Environments with the starts and the scale of rewards that the settings ask for."""
+    """Environments with a clock, and with the starts and the scale of rewards that the settings ask for."""
     plain = make_sb3_vec_env(check_env_id(env_id), config.n_envs, **config.env_kwargs)
     envs: VecEnv = plain
     if config.start_energy:
         steps = round(config.start_share * config.timesteps)
-        envs = MovingStarts(plain, config.start_energy, steps, training_seed(seed))
-    return ScaledReward(envs, config.reward_scale)
+        envs = MovingStarts(plain, config.start_energy, config.start_offset, steps, training_seed(seed))
+    return Clock(ScaledReward(envs, config.reward_scale))
 
 
 def _compile(envs: LocomotionVectorEnv, env_id: str, config: PPOConfig) -> None:
@@ -174,7 +177,7 @@ def arguments(config: PPOConfig) -> dict[str, Any]:
         "gae_lambda": config.gae_lambda,
         "clip_range": config.clip_range,
         "target_kl": config.target_kl,
-        "ent_coef": config.entropy,
+        "ent_coef": config.entropy[0],
         "policy_kwargs": {
             "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
             "activation_fn": torch.nn.Tanh,
@@ -186,7 +189,7 @@ def arguments(config: PPOConfig) -> dict[str, Any]:
 def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
     """An untrained model."""
     envs = make_envs_to_learn_in(env_id, config, seed)
-    return PPO("MlpPolicy", envs, seed=training_seed(seed), device="cpu", **arguments(config))
+    return PPO(TimeAwareCritic, envs, seed=training_seed(seed), device="cpu", **arguments(config))
 
 
 def train_piece(

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
@@ -15,7 +16,7 @@ from mechanics.model import Model
 from nhenv.sb3 import SB3VecEnv
 from nhenv.vector_env import LocomotionVectorEnv
 
-__all__ = ["MovingStarts", "ScaledReward"]
+__all__ = ["Clock", "MovingStarts", "ScaledReward"]
 
 Array = NDArray[np.float64]
 
@@ -60,24 +61,25 @@ class MovingStarts(_Pickled):
     At rest nothing tells a policy what momentum is worth. One that has begun in motion often enough knows, and then
     finds out by itself how to come by it.
 
-    Such an episode begins at the origin, with any heading, joints anywhere within their stops and at rest, and other
-    pseudo-velocities in any direction, with a kinetic energy that is uniform up to `energy`.
+    Such an episode begins with any heading, joints anywhere within their stops and at rest, and other pseudo-velocities
+    in any direction, with a kinetic energy that is uniform up to `energy`; in x and y, anywhere up to `offset` from the
+    origin, from where its targets are drawn. So who is to come back has seen what being away is like.
 
     Args:
         venv: native environments of `nhenv.sb3.make_sb3_vec_env`.
         energy: largest kinetic energy at the start, J.
+        offset: largest distance from the origin along x and along y, m.
         steps: environment steps, over all rows, after which every episode begins at rest.
         seed: seed of these starts.
     """
 
-    def __init__(self, venv: SB3VecEnv, energy: float, steps: int, seed: int) -> None:
+    def __init__(self, venv: SB3VecEnv, energy: float, offset: float, steps: int, seed: int) -> None:
         super().__init__(venv)
-        envs = venv.vector_env.unwrapped
-        if not isinstance(envs, LocomotionVectorEnv):
-            raise TypeError(f"only native environments can begin in motion, got {envs}")
-        self.energy, self.steps, self.taken = energy, steps, 0
+        self._envs = _native(venv, "begin in motion")
+        self.energy, self.offset, self.steps, self.taken = energy, offset, steps, 0
         self._rng = np.random.default_rng([seed, 1])
-        self._envs = envs
+        mechanism = self._envs.mechanism
+        self._place = [mechanism.coordinates.index(name) for name in mechanism.fibre[:2]]
 
     @cached_property
     def _model(self) -> Model:
@@ -107,7 +109,12 @@ class MovingStarts(_Pickled):
         # Every row takes part in the drawing, so that what one gets does not depend on the others.
         q, qdot = self._states()
         elapsed = self._envs.elapsed_steps  # first episodes end out of phase
-        seen, _ = self._envs.reset(options={"reset_mask": moving, "q": q, "qdot": qdot})
+        start = {"reset_mask": moving, "q": q, "qdot": qdot}
+        seen, _ = self._envs.reset(options=start)
+        if self.offset:
+            away = self._rng.uniform(-self.offset, self.offset, (self.num_envs, 2))
+            q[:, self._place] += away
+            seen, _ = self._envs.reset(options=start | {"target": self._envs.targets})
         self._envs.elapsed_steps = elapsed
         return np.where(moving[:, None], seen, observations)
 
@@ -124,3 +131,51 @@ class MovingStarts(_Pickled):
         v = np.where(turns, 0.0, self._rng.normal(size=(rows, mechanism.rank)))
         v *= np.sqrt(self._rng.uniform(0, self.energy, rows) / model.energy(q, v))[:, None]
         return q, model.velocity(q, v)
+
+
+class Clock(_Pickled):
+    """Shows how much of the episode is over, and makes the time limit an end like any other.
+
+    What is still to come depends on the time that is left, so whoever is to foretell it has to see it (Pardo et al.,
+    *Time limits in reinforcement learning*, 2018). It is the last observation, from -1 to 1; `training.time_aware`
+    shows it to the value function and not to the policy.
+
+    Args:
+        venv: native environments of `nhenv.sb3.make_sb3_vec_env`, with a time limit, wrapped or not.
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        self._envs = _native(venv, "tell the time")
+        limit = self._envs.max_episode_steps
+        if limit is None:
+            raise ValueError("without max_episode_steps there is no time that is left: give the environments a limit")
+        shown = venv.observation_space
+        assert isinstance(shown, spaces.Box)
+        ends = np.append(shown.low, np.float32(-1)), np.append(shown.high, np.float32(1))
+        super().__init__(venv, observation_space=spaces.Box(*ends, dtype=np.float32))
+        self._limit = limit
+
+    def reset(self) -> NDArray[np.float32]:
+        """Reset all rows."""
+        return self._with_time(self.venv.reset())
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all rows."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for row in np.flatnonzero(dones):
+            infos[row]["TimeLimit.truncated"] = False  # else Stable-Baselines3 adds what would come after
+        return self._with_time(observations), rewards, dones, infos
+
+    def _with_time(self, observations: VecEnvObs) -> NDArray[np.float32]:
+        over = 2 * self._envs.elapsed_steps / self._limit - 1
+        return np.column_stack([np.asarray(observations), over.astype(np.float32)])
+
+
+def _native(venv: VecEnv, what: str) -> LocomotionVectorEnv:
+    """The environments within all wrappers, which are to do `what`."""
+    while isinstance(venv, VecEnvWrapper):
+        venv = venv.venv
+    envs = venv.vector_env.unwrapped if isinstance(venv, SB3VecEnv) else venv
+    if not isinstance(envs, LocomotionVectorEnv):
+        raise TypeError(f"only native environments can {what}, got {envs}")
+    return envs

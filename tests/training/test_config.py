@@ -4,6 +4,7 @@ import os
 
 import pytest
 
+import mechanics
 import nhenv
 from nhenv import tasks
 from training import evaluate, metrics, train, wrappers
@@ -131,14 +132,20 @@ def test_an_experiment_within_an_environment_is_so_in_all_its_parts():
     config = for_env(SNAKEBOARD, drag=True)
     parts = [*config.gaits.values(), config.ppo, config.evaluation]
     assert [part.env_kwargs for part in parts] == [{"drag": True}] * len(parts)
-    assert within(config) == dataclasses.replace(for_env(SNAKEBOARD), ppo=CONFIGS["Forward"].ppo)
+    assert within(config) == dataclasses.replace(for_env(SNAKEBOARD), ppo=CONFIGS["Forward"].ppo_of["snakeboard, drag"])
 
 
-def test_a_mechanism_has_settings_of_its_own_where_no_drag_acts():
+def test_a_mechanism_has_settings_of_its_own_with_drag_and_without():
     forward = CONFIGS["Forward"]
     assert for_env(SNAKEBOARD).ppo == forward.ppo_of["snakeboard"] != forward.ppo
-    assert for_env(SNAKEBOARD, drag=True).ppo == dataclasses.replace(forward.ppo, env_kwargs={"drag": True})
-    assert for_env("nhenv/RollerRacerForward-v0").ppo == forward.ppo
+    with_drag = dataclasses.replace(forward.ppo_of["snakeboard, drag"], env_kwargs={"drag": True})
+    assert for_env(SNAKEBOARD, drag=True).ppo == with_drag
+    assert for_env("nhenv/CarForward-v0").ppo == forward.ppo
+
+
+def test_settings_of_their_own_are_of_mechanisms_that_there_are():
+    known = {f"{name}{drag}" for name in mechanics.names() for drag in ("", ", drag")}
+    assert all(set(config.ppo_of) <= known for config in CONFIGS.values())
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):

@@ -40,7 +40,9 @@ def test_an_entry_makes_the_same_model(env_id):
     kwargs = eval(given.pop("policy_kwargs"), {"nn": nn, "dict": dict})
     theirs = PPO(given.pop("policy"), envs, learning_rate=float(rate), policy_kwargs=kwargs, device="cpu", **given)
     ours = make_model(env_id, config, 0)
-    assert str(theirs.policy) == str(ours.policy)
+    nets, own = theirs.policy.mlp_extractor, ours.policy.mlp_extractor
+    assert str(nets.policy_net) == str(own.policy_net)
+    assert str(nets.value_net[1:]) == str(own.value_net[1:])  # whose first layer sees the time here
     assert theirs.policy.log_std.tolist() == ours.policy.log_std.tolist()
     for name in ("n_envs", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "target_kl", "ent_coef"):
         assert getattr(theirs, name) == getattr(ours, name), name

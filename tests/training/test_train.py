@@ -17,7 +17,7 @@ from training.train import Linear, Run, Train, make_model, ppo_path, train_piece
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = PPOConfig(
     timesteps=1280, n_envs=4, n_steps=32, batch_size=64, n_epochs=2, curve_every=2, curve_episodes=1,
-    checkpoint_every=3, reward_scale=0.1, start_energy=20.0,
+    checkpoint_every=3, reward_scale=0.1, start_energy=10.0,
 )  # fmt: skip
 
 
@@ -127,7 +127,7 @@ def test_settings_reach_the_algorithm():
     # None of these is a default of Stable-Baselines3.
     config = PPOConfig(
         n_envs=2, n_steps=8, batch_size=4, n_epochs=3, learning_rate=(4e-3, 2e-3), gamma=0.9, gae_lambda=0.8,
-        clip_range=0.3, target_kl=0.07, entropy=0.01, log_std=-0.5, hidden=(16, 8),
+        clip_range=0.3, target_kl=0.07, entropy=(0.01, 0.0), log_std=-0.5, hidden=(16, 8),
         reward_scale=0.25, start_energy=7.0, start_share=0.5, timesteps=6000,
     )  # fmt: skip
     model = make_model(SNAKEBOARD, config, 3)
@@ -135,13 +135,47 @@ def test_settings_reach_the_algorithm():
     assert (model.n_envs, model.n_steps, model.batch_size, model.n_epochs) == (2, 8, 4, 3)
     assert (model.gamma, model.gae_lambda, model.clip_range(1.0), model.target_kl) == (0.9, 0.8, 0.3, 0.07)
     assert model.ent_coef == 0.01
-    assert model.env.factor == 0.25
-    assert (model.env.venv.energy, model.env.venv.steps) == (7.0, 3000)
+    assert model.env.venv.factor == 0.25
+    assert (model.env.venv.venv.energy, model.env.venv.venv.steps) == (7.0, 3000)
     assert [model.lr_schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([4e-3, 3e-3, 2e-3])
     assert model.policy.log_std.tolist() == [-0.5, -0.5]
     for net in (model.policy.mlp_extractor.policy_net, model.policy.mlp_extractor.value_net):
         assert [type(layer) for layer in net] == [torch.nn.Linear, torch.nn.Tanh] * 2
         assert [layer.out_features for layer in net[::2]] == [16, 8]
+
+
+def test_the_value_function_sees_the_time_and_the_policy_does_not():
+    model = make_model(SNAKEBOARD, TINY, 0)
+    shown = torch.tensor(model.env.reset())
+    assert shown.shape[1] == 7
+    later = shown.clone()
+    later[:, -1] += 0.5
+    values, means = zip(
+        *((model.policy.predict_values(x), model.policy.get_distribution(x).distribution.mean) for x in (shown, later)),
+        strict=True,
+    )
+    assert (values[0] != values[1]).all()
+    assert torch.equal(*means)
+    # It drives environments without a clock, too.
+    with_time, without = (model.predict(x.numpy(), deterministic=True)[0] for x in (shown, shown[:, :-1]))
+    assert np.array_equal(with_time, without)
+    assert model.predict(shown[0, :-1].numpy(), deterministic=True)[0].shape == (2,)
+
+
+def test_entropy_falls_from_its_first_value_to_its_last(tmp_path):
+    config = dataclasses.replace(TINY, entropy=(0.4, 0.2))
+    heard = []
+
+    class Heard(Run):
+        def _on_rollout_start(self):
+            super()._on_rollout_start()
+            heard.append(self.model.ent_coef)
+
+    model = make_model(SNAKEBOARD, config, 0)
+    model.learn(config.timesteps, callback=Heard(SNAKEBOARD, config, tmp_path / "checkpoint", ignore))
+    steps = np.arange(len(heard)) * config.n_envs * config.n_steps
+    assert len(heard) > 3
+    assert heard == pytest.approx(0.4 - 0.2 * steps / config.timesteps)
 
 
 def test_it_learns_in_the_environment_that_is_asked_for(tmp_path):
@@ -163,7 +197,6 @@ def test_first_episodes_end_out_of_phase_and_later_ones_do_not():
     for step in range(1, 601):
         _, _, dones, infos = envs.step(np.zeros((count, 2), np.float32))
         for i in np.flatnonzero(dones):
-            assert infos[i]["TimeLimit.truncated"]
             ends[i].append(step)
     first = [times[0] for times in ends]
     assert len(set(first)) == count

@@ -6,16 +6,15 @@ from scipy.stats import kstest
 
 from mechanics.model import Model
 from nhenv.sb3 import SB3VecEnv, make_sb3_vec_env
-from training.wrappers import MovingStarts, ScaledReward
+from training.wrappers import Clock, MovingStarts, ScaledReward
 
 SNAKEBOARD, RACER = "nhenv/SnakeboardForward-v0", "nhenv/RollerRacerForward-v0"
 ENERGY, ROWS = 40.0, 400
 
 
-def _made(env_id, rows=ROWS, steps=10**9, **arguments):
-    return MovingStarts(
-        make_sb3_vec_env(env_id, rows, staggered=False, whole_state=True, **arguments), ENERGY, steps, seed=3
-    )
+def _made(env_id, rows=ROWS, steps=10**9, offset=0.0, **arguments):
+    envs = make_sb3_vec_env(env_id, rows, staggered=False, whole_state=True, **arguments)
+    return MovingStarts(envs, ENERGY, offset, steps, seed=3)
 
 
 def _inner(envs):
@@ -45,13 +44,27 @@ def test_first_episodes_begin_in_motion(env_id):
 
 def test_a_seed_has_starts_of_its_own():
     def starts(seed):
-        envs = MovingStarts(make_sb3_vec_env(SNAKEBOARD, 3, seed=0, whole_state=True), ENERGY, 10**9, seed)
+        envs = MovingStarts(make_sb3_vec_env(SNAKEBOARD, 3, seed=0, whole_state=True), ENERGY, 0.0, 10**9, seed)
         envs.reset()
         return _inner(envs).q[:, 2], _inner(envs).energy
 
     first, again, other = (starts(seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (np.array(first) != other).all()
+
+
+def test_episodes_begin_away_from_where_their_targets_were_drawn():
+    envs = _made("nhenv/SnakeboardTurn-v0", offset=0.5)
+    observations, inner = envs.reset(), _inner(envs)
+    assert kstest(inner.q[:, :2].ravel(), "uniform", (-0.5, 1.0)).pvalue > 0.01
+    assert all((inner.targets[name] == 0).all() for name in ("start_x", "start_y"))
+    turn = np.abs(inner.targets["target_heading"] - inner.q[:, 2])
+    assert kstest(turn, "uniform", (np.pi / 4, 3 * np.pi / 4)).pvalue > 0.01
+    # What is seen is this place and not the origin: start_ahead and start_left.
+    seen = [inner.observation_labels.index(f"start_{way}") for way in ("ahead", "left")]
+    away = np.hypot(*inner.q[:, :2].T)
+    assert np.hypot(*observations[:, seen].T) == pytest.approx(away, rel=1e-6)  # float32
+    assert kstest(inner.energy, "uniform", (0, ENERGY)).pvalue > 0.01
 
 
 def test_ever_fewer_begin_in_motion_and_at_last_none():
@@ -71,7 +84,7 @@ def test_ever_fewer_begin_in_motion_and_at_last_none():
 
 def test_rows_whose_episodes_go_on_do_so():
     """Nothing drives them, so that they keep their energy, while others begin anew."""
-    envs = MovingStarts(make_sb3_vec_env(SNAKEBOARD, 50, seed=2, whole_state=True), ENERGY, 10**9, seed=3)
+    envs = MovingStarts(make_sb3_vec_env(SNAKEBOARD, 50, seed=2, whole_state=True), ENERGY, 0.0, 10**9, seed=3)
     envs.reset()
     inner, begun = _inner(envs), 0
     for _ in range(40):
@@ -110,7 +123,38 @@ def test_rewards_are_scaled_and_nothing_else():
     assert (first[1] != 0).all()
 
 
+def test_the_clock_shows_the_time_and_makes_the_limit_an_end():
+    envs, plain = (make_sb3_vec_env(SNAKEBOARD, 5, seed=1) for _ in range(2))  # out of phase at first
+    clocked = Clock(ScaledReward(envs, 1.0))
+    seen, bare = clocked.reset(), plain.reset()
+    assert clocked.observation_space.contains(seen[0])
+    over = 150 * (1 + seen[:, -1])
+    assert len(set(over)) == 5
+    ended = 0
+    for _ in range(350):
+        (seen, *_, infos), (bare, _, dones, told) = (
+            each.step(np.full((5, 2), 0.3, np.float32)) for each in (clocked, plain)
+        )
+        over = np.where(dones, 0, over + 1)
+        assert np.array_equal(seen[:, :-1], bare)
+        assert seen[:, -1] == pytest.approx(over / 150 - 1, abs=1e-6)  # float32
+        for row in np.flatnonzero(dones):
+            assert told[row]["TimeLimit.truncated"]
+            assert not infos[row]["TimeLimit.truncated"]
+            ended += 1
+    assert ended >= 5
+
+
+def test_a_clock_needs_a_limit():
+    envs = make_sb3_vec_env(SNAKEBOARD, 1, staggered=False, max_episode_steps=None)
+    envs.vector_env.unwrapped.max_episode_steps = None
+    with pytest.raises(ValueError, match="without max_episode_steps"):
+        Clock(envs)
+
+
 def test_other_environments_are_refused():
     envs = SyncVectorEnv([lambda: gym.make(SNAKEBOARD)], autoreset_mode=AutoresetMode.SAME_STEP)
     with pytest.raises(TypeError, match="only native environments can begin in motion"):
-        MovingStarts(SB3VecEnv(envs), 1.0, 1, 0)
+        MovingStarts(SB3VecEnv(envs), 1.0, 0.0, 1, 0)
+    with pytest.raises(TypeError, match="only native environments can tell the time"):
+        Clock(SB3VecEnv(envs))
