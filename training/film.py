@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 from nhenv import render
 from nhenv.canvas import Canvas
 from nhenv.vector_env import LocomotionVectorEnv
+from training import policies
 from training.config import EVALUATION_SEEDS
 from training.evaluate import Controller, load_policy, rollout
 from training.store import read_json, write_bytes
@@ -95,10 +96,13 @@ class _Random:
 
 
 def actor(path: Path, label: str | None = None) -> Actor:
-    """What a file of a results folder holds: a tuned gait (JSON), or a policy (its zip file, or the JSON beside it).
+    """What a file holds: a tuned gait (JSON), or a policy (.safetensors, .zip, or the JSON beside a zip file).
 
-    Loading a policy unpickles it: only load what you trust.
+    Loading a zip file unpickles it: only load what you trust.
     """
+    if path.suffix == policies.SUFFIX:
+        policy = policies.load(path)
+        return Actor(label or "PPO", policy.card["env_id"], policy.card["env_kwargs"], lambda envs: policy)
     beside = path.with_suffix(".json")
     for file in (path, beside):
         if not file.is_file():
@@ -314,7 +318,7 @@ class Film:
     Loading a policy unpickles it, which can run any code: only film files that you trust.
 
     Attributes:
-        pieces: files of a results folder: gait-*.json, ppo-*.zip. None for random actions.
+        pieces: gait-*.json or ppo-*.zip of a results folder, or *.safetensors. None for random actions.
         env_id: environment of the random actions; the files name their own.
         labels: what the film calls them, in their order.
         out: file to write, .gif or .mp4. It is there whole or not at all.

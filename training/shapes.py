@@ -131,7 +131,7 @@ class Shapes:
     Loading a policy unpickles it, which can run any code: only draw files that you trust.
 
     Attributes:
-        pieces: files of a results folder: gait-*.json, ppo-*.zip, one to four of one environment.
+        pieces: gait-*.json or ppo-*.zip of a results folder, or *.safetensors, one to four of one environment.
         labels: what the figure calls them, in their order.
         out: PNG to write.
         seed: number of the start, counted among those on which controllers are judged.

@@ -15,6 +15,7 @@ from nhenv import render
 from training import film as films
 from training.config import EVALUATION_SEEDS
 from training.film import TRAILS, Film, actor, film, frames, gif, length, mp4, random_actor, record
+from training.policies import SHIPPED, SUFFIX, load, shipped
 from training.store import settings, write_json
 
 RACER, GOAL = "nhenv/RollerRacerForward-v0", "nhenv/RollerRacerGoal-v0"
@@ -194,6 +195,14 @@ def test_a_policy_is_an_actor(tmp_path):
     piece(tmp_path / "ppo-seed3.json", ppo={"env_kwargs": {"drag": True}}, seed=3)
     one = actor(tmp_path / "ppo-seed3.zip")
     assert (one.label, one.env_kwargs) == ("PPO, seed 3", {"drag": True})
+
+
+def test_a_shipped_policy_is_an_actor():
+    policy = load(shipped()[0])
+    one = actor(SHIPPED / f"{shipped()[0]}{SUFFIX}")
+    assert (one.env_id, one.env_kwargs) == (policy.card["env_id"], policy.card["env_kwargs"])
+    seen = np.ones(len(policy.card["observation"]), np.float32)
+    assert np.array_equal(one.make(None)(seen), policy(seen))
 
 
 def test_impossible_films(tmp_path):
