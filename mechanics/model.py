@@ -106,6 +106,14 @@ class Model:
         """Rates of (q, v, work) as a tuple: the right-hand side for an ODE solver, nothing checked."""
         return self._functions.right_hand_side(*state, *u, self._constants)
 
+    def trust(self, state: Sequence[float], tolerance: float) -> float:
+        """Share of a tolerance that may be used in a state (q, ...): 1 but near a pole of the frame.
+
+        Not positive where roundings alone are more than the tolerance: see `mechanics.compiler.margins`.
+        """
+        shares = self._functions.trust(*state[: self.mechanism.n], tolerance, self._constants)
+        return float(min([1.0, *shares]))
+
     def _state(self, q: ArrayLike, v: ArrayLike) -> tuple[tuple[ArrayLike, int, str], ...]:
         return (q, self.mechanism.n, "q"), (v, self.mechanism.rank, "v")
 
@@ -148,11 +156,12 @@ def _source(mechanism: Mechanism, rows: Any, drag: bool) -> str:
 
     from mechanics.compiler.backends import BACKENDS
     from mechanics.compiler.codegen import Program, needed
+    from mechanics.compiler.margins import trust
     from mechanics.geometry.reduction import derive
 
     equations: ReducedEquations = derive(mechanism, rows, drag=drag)
     q, v, u = equations.coordinates, equations.pseudo_velocities, equations.controls
-    qdot = sp.symbols([f"{c.name}__dot" for c in q])
+    qdot, tolerance = sp.symbols([f"{c.name}__dot" for c in q]), sp.Symbol("_tolerance")
     forms = [[mechanism.symbolic(text) for text in row] for row in mechanism.one_forms]
     forces = [[mechanism.symbolic(text) for text in row] for row in mechanism.forces.values()]
     rate_of = dict(zip((*q, *v), (*equations.velocity, *equations.acceleration), strict=True))
@@ -183,6 +192,7 @@ def _source(mechanism: Mechanism, rows: Any, drag: bool) -> str:
         "energy": ((*q, *v), [equations.energy]),
         "power": ((*q, *v, *u), [power]),
         "residual": ((*q, *qdot), [sum(a * b for a, b in zip(row, qdot, strict=True)) for row in forms]),
+        "trust": ((*q, tolerance), list(trust(equations, rows, tolerance))),
         "right_hand_side": ((*q, *v, sp.Symbol("_work"), *u), [*rate_of.values(), power]),
     }
     outputs = {f"{group}:{i}": e for group, (_, es) in groups.items() for i, e in enumerate(es)}

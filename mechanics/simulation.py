@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,7 @@ Torque = Callable[[float], Array]
 # the result within it for 10 s of the reference trajectories, which grow up to a hundredfold.
 SAFETY = 100
 SMALLEST_TOLERANCE = 3e-14  # SciPy's own bound
+LEAST_TRUST = 1e-4  # near a pole of the frame; with less, steps would become ever shorter
 
 
 class SimulationError(RuntimeError):
@@ -120,7 +122,7 @@ def _integrate(
             u = zero if torque is None else torque(min(time, bound)).tolist()  # noqa: B023 (the present bound)
             return np.array(model.scalar_rates(y.tolist(), u))
 
-        solver = DOP853(rates, start, state, bound, rtol=rtol, atol=atol)
+        solver: Any = DOP853(rates, start, state, bound, rtol=rtol, atol=atol)
         while solver.status == "running":
             if torque is not None:
                 jump = first_jump(torque, solver.t, min(solver.t + solver.h_abs, bound))
@@ -129,15 +131,23 @@ def _integrate(
                     solver = DOP853(rates, solver.t, solver.y, bound, rtol=rtol, atol=atol)
                     if solver.t == bound:
                         break
+            time, y = solver.t, solver.y
+            trust = model.trust(y.tolist(), rtol * SAFETY)
+            # An absolute error is what a pole makes large; it leaves a relative one as it is.
+            solver.rtol, solver.atol = max(rtol * trust**2, SMALLEST_TOLERANCE), atol * trust**2
             # A step size that is not a number would be halved for ever.
-            message = solver.step() if np.isfinite(solver.h_abs) else None
-            if solver.status == "failed" or not np.isfinite([*solver.y, solver.h_abs]).all():
+            message = solver.step() if trust > LEAST_TRUST and np.isfinite(solver.h_abs) else None
+            after = model.trust(solver.y.tolist(), rtol * SAFETY)
+            lost = solver.status == "failed" or min(trust, after) <= LEAST_TRUST
+            if lost or not np.isfinite([*solver.y, solver.h_abs]).all():
                 raise SimulationError(
                     f"{model.mechanism.name}: the motion could not be followed beyond t = {solver.t:.6g} s "
-                    f"({message or 'it is not finite there'}); last configuration "
+                    f"({message or 'it is not finite there, or too near a pole of the frame'}); last configuration "
                     f"{state[: model.mechanism.n].tolist()}. A frame with a pole, such as the roller racer's "
                     "'paper' frame, fails where the mechanism does not."
                 )
+            if after < trust / 2:  # it came closer to a pole than it had been careful for
+                solver = DOP853(rates, time, y, bound, rtol=rtol, atol=atol, first_step=(solver.t - time) / 2)
         state, start = solver.y, following
     return state
 

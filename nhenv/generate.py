@@ -19,6 +19,7 @@ from mechanics.compiler.backends import BACKENDS, Backend
 from mechanics.compiler.codegen import Program, integrated, operation_count
 from mechanics.compiler.dataflow import analyse, initial
 from mechanics.compiler.integrators import Method, method
+from mechanics.compiler.margins import trust
 from mechanics.expressions import ExpressionError, to_sympy
 from mechanics.geometry.energy import conserved
 from mechanics.geometry.reduction import ReducedEquations, derive
@@ -69,8 +70,9 @@ class Generator:
         self.rules = self._rules()
         self.method, self.substeps = self._method()
         self.controlled = scene.tolerance < inf  # then a flight may turn out not to be right
+        self.trust = self._trust() if self.controlled else {}
         self.events = bool(self.joints) or self.controlled  # so that a hold may take more than one flight
-        texts = {**observation, **judgement, **ending, **self.motion, **self.rules, **self.energy}
+        texts = {**observation, **judgement, **ending, **self.motion, **self.rules, **self.energy, **self.trust}
         self.program = Program(
             {**integrated(self.flow), **texts}, [sp.Symbol(name) for name in scene.parameters], equations.definitions
         )
@@ -140,6 +142,13 @@ class Generator:
             name, substeps = self.scene.integrator, 1
         return method(name), self.scene.substeps or substeps
 
+    def _trust(self) -> dict[str, sp.Expr]:
+        """Shares of the tolerance that may be used near poles of the frame, as far as this scene knows where it is."""
+        known = {*self.flow.states, *self.equations.parameters, *(symbol for symbol, _ in self.equations.definitions)}
+        frame = self.scene.mechanism.frame_rows(self.scene.frame)
+        shares = trust(self.equations, frame, self.scene.tolerance)
+        return {f"trust:{i}": share for i, share in enumerate(shares) if share.free_symbols <= known}
+
     def may_release(self, angle: sp.Symbol, rate: sp.Symbol) -> bool:
         """Whether what presses a joint against its stop can change while the controls are held and the joint rests."""
         meanings: dict[sp.Symbol, sp.Expr] = {}
@@ -203,6 +212,7 @@ class Generator:
             streams,
             self.scene.tolerance,
             self.speeds,
+            list(self.trust),
         )
 
     def _clear_joints(self, backend: Backend) -> str:

@@ -173,11 +173,14 @@ class Program:
         streams: int = 1,
         tolerance: float = inf,
         speeds: Sequence[sp.Symbol] = (),
+        trust: Sequence[str] = (),
     ) -> str:
         """Source of `name(_h, *states, *carried, *held, _k)` -> states after _h seconds, and whether they are right.
 
         They are if no substep, by the method's own estimate, makes a state z wrong by more than `tolerance` (1 + |z|),
         or turns an angle so far that the estimate might be deceived; always, and unchecked, if that is infinite.
+        Of the tolerance, the square of the least of the outputs `trust` at a substep's first and last node may be used,
+        all of it above 1, none if that is not positive.
 
         With several streams, of one that takes these arguments for one system after the other, and does every
         operation for one after the other: what one waits for, another uses the time of.
@@ -207,7 +210,7 @@ class Program:
             stage.others = stages
         integrated_states = [state for state in flow.states if state not in flow.solutions]
         estimated = integrated_states if tolerance < inf else []
-        doubts = [weights for weights, _ in method.estimates] if estimated else []
+        estimates = [weights for weights, _ in method.estimates] if estimated else []
         for state in flow.solutions:
             end[state] = body.polynomial(state, "_h", start)
         if method.explicit:
@@ -218,7 +221,7 @@ class Program:
                     if weight:  # summed up on the way, lest all rates be kept until the end
                         total = backend.sum_of_products([(repr(weight), rate)], end[state])
                         end[state] = body.assign(f"_e_{state.name}{stage.suffix}", total)
-                    for which, weights in enumerate(doubts):
+                    for which, weights in enumerate(estimates):
                         if weights[i]:
                             total = backend.sum_of_products([(repr(weights[i]), rate)], errors.get((state, which), ""))
                             errors[state, which] = body.assign(f"_d{which}_{state.name}{stage.suffix}", total)
@@ -226,12 +229,14 @@ class Program:
             for state in integrated_states:
                 total = body.moved(state.name, method.b, stages, methodcaller("rate", state))
                 end[state] = body.assign(f"_e_{state.name}", total)
-            for which, weights in enumerate(doubts):
+            for which, weights in enumerate(estimates):
                 for state in estimated:
                     errors[state, which] = body.moved("", weights, stages, methodcaller("rate", state))
         right = ["_right"] * (substeps > 1)
         if estimated:
             limits = list(map(repr, method.thresholds(tolerance)))
+            if trust:
+                limits = self._trusted(body, limits, trust, (stages[0], stages[-1]))
             for (state, which), error in errors.items():
                 bound = backend.sum_of_products([(limits[which], f"fabs({end[state]})")], limits[which])
                 right.append(f"(fabs({error}) <= {bound})")
@@ -257,6 +262,16 @@ class Program:
             lines = ["_right = True", f"_h = _h*{1 / substeps!r}", f"for _ in range({substeps}):\n{loop}"]
         lines = [*self._unpack(body), *lines, f"return ({''.join(f'{n}, ' for n in names)})"]
         return _function(name, [*arguments, "_k"], lines, backend.decorator)
+
+    def _trusted(self, body: _Body, limits: Sequence[str], trust: Sequence[str], nodes: Sequence[_Stage]) -> list[str]:
+        """Lines that find out how much of some limits may be used, and the names of what is left."""
+        share = "1.0"
+        for name in trust:
+            for node in nodes:
+                value = body.assign(f"_{name.replace(':', '')}{node.suffix}", body.value(self.outputs[name], node))
+                share = body.assign(f"_share{value}", f"{value} if {value} < {share} else {share}")
+        square = body.assign("_square", f"{share}*fabs({share})")
+        return [body.assign(f"_limit{i}", f"{limit}*{square}") for i, limit in enumerate(limits)]
 
     def _energy_kept(
         self,

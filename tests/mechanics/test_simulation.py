@@ -1,11 +1,13 @@
 """`simulate` against trajectories of the multiplier formulation in quadruple precision."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 
 import mechanics
+from benchmarks.multipliers import DIGITS, Multipliers
 from mechanics.jumps import first_jump
 
 # The reference is good to 1e-25; the bound is the project's promise for q and q̇, and holds with
@@ -179,3 +181,46 @@ def test_catalogue_frames_all_simulate():
         ends = [mechanics.simulate(mechanism, [0, 1], q0, qdot0=qdot0, frame=frame).q[-1] for frame in mechanism.frames]
         for one, other in itertools.pairwise(ends):
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)  # the accuracy aimed at
+
+
+# -- where a frame fails -----------------------------------------------------------------------------
+
+
+def _near_failure(frame, rng):
+    """(parameters, q, q̇) of a racer near a pole of the frame "paper", or near where the others' X₁ vanishes."""
+    params, side = {}, rng.choice([-1, 1])
+    if frame == "paper":
+        psi = side * (math.acos(-1 / 3) + rng.choice([-1, 1]) * 10 ** rng.uniform(-6, -0.2))
+    else:
+        psi = math.pi + side * 10 ** rng.uniform(-6, -0.2)
+        params = {"l_2": 0.3 * (1 + rng.choice([-1, 1]) * 10 ** rng.uniform(-9, -1))}
+    rate = 10 ** rng.uniform(-1, 1.2)
+    return params, np.array([0.1, -0.2, 0.4, psi]), rng.uniform(-rate, rate, 4)
+
+
+@pytest.mark.skipif(DIGITS < 18, reason="long doubles are no longer than doubles here: there is no reference")
+@pytest.mark.parametrize("frame", ["paper", "regular", "orthonormal"])
+def test_where_a_frame_fails_the_motion_is_right_or_refused(frame):
+    """Against multipliers, which have no frame. With one tolerance everywhere, half of those in "paper" are wrong."""
+    mechanism, rng, refused, errors = mechanics.get("roller_racer"), np.random.default_rng(0), 0, []
+    truth = Multipliers(mechanism)
+    for _ in range(60):
+        params, q, qdot = _near_failure(frame, rng)
+        everything = {**mechanism.parameters, **params}
+        u = rng.uniform(-0.4, 0.4, 1)
+        try:
+            model = mechanics.Model(mechanism, params, frame)
+            qdot = model.velocity(q, model.project(q, truth.feasible(q[None], qdot[None], everything)[0].astype(float)))
+            run = mechanics.simulate(
+                mechanism, [0, 0.05], q, qdot0=qdot, controls=lambda t, u=u: u, params=params, frame=frame
+            )
+        except mechanics.SimulationError:
+            refused += 1
+            continue
+        true = truth.hold(q[None], qdot[None], u[None], 0.05, everything)
+        assert true.resolved.all()
+        for ours, theirs in ((run.q[-1], true.q[0]), (run.qdot[-1], true.qdot[0])):
+            errors.append((np.abs(ours - theirs) / (1 + np.abs(theirs))).max())
+    assert max(errors) < REFERENCE_TOLERANCE
+    assert refused >= 10
+    assert len(errors) >= 2 * 10
