@@ -244,7 +244,7 @@ class TaskConfig:
 # Targets differ more than starts at rest do: it takes more of them to tell who is better.
 _JUDGED_OFTEN = EvaluationConfig(episodes=1000)
 _VARIED = PPOConfig(
-    timesteps=2_000_000, gamma=0.99, reward_scale=0.1, entropy=(0.01, 0.0), start_energy=4.0, curve_episodes=64
+    timesteps=1_000_000, gamma=0.99, reward_scale=0.1, entropy=(0.01, 0.0), start_energy=4.0, curve_episodes=64
 )
 _gait = partial(GaitConfig, starts=16)
 
