@@ -102,7 +102,7 @@ def mathtext(name: str) -> str:
 def _height_of_paths(envs: LocomotionVectorEnv, shown: Sequence[Shown]) -> float:
     """Height in inches at which the paths fill the width of the figure, and a line of legend fits."""
     x, y, _ = (envs.mechanism.coordinates.index(name) for name in envs.mechanism.fibre)
-    wide, high = (np.ptp([one.episodes.q[0][:, i] for one in shown]) for i in (x, y))
+    wide, high = (np.ptp(np.concatenate([one.episodes.q[0][:, i] for one in shown])) for i in (x, y))
     return float(np.clip(9 * high / max(wide, 1e-9), 0.5, 3.5)) + 0.5
 
 

@@ -7,7 +7,7 @@ import pytest
 import mechanics
 import nhenv
 from nhenv import tasks
-from training import evaluate, metrics, train, wrappers
+from training import evaluate, metrics, time_aware, train, wrappers
 from training.config import (
     COMPARED,
     CONFIGS,
@@ -88,7 +88,7 @@ def test_path_depends_on_seed_environment_and_code(tmp_path):
 
 
 def test_code_of_a_result_is_that_of_all_modules_from_which_it_follows():
-    made_of = source_digest(*(module.__file__ for module in (train, wrappers, evaluate, metrics)))
+    made_of = source_digest(*(module.__file__ for module in (train, wrappers, time_aware, evaluate, metrics)))
     assert ppo_settings(SNAKEBOARD, PPOConfig(), 0)["code"] == made_of
 
 
