@@ -64,8 +64,6 @@ def observations_like(labels, count=2000):
 def test_it_acts_as_stable_baselines_does(trained, exported):
     model, policy = load_policy(trained).model, load(exported)
     with torch.no_grad():  # as decided as a policy is after a long training, and clipped now and then
-        for parameter in model.policy.mlp_extractor.policy_net.parameters():
-            parameter *= 2
         torch.manual_seed(0)
         torch.nn.init.normal_(model.policy.action_net.weight, std=0.5)
     policy = read(dict(policy.card, sha256=digest_of(model)), pack(actor(PolicyController(model))))
