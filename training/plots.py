@@ -190,6 +190,6 @@ def _drift(values: np.ndarray) -> np.ndarray:
 
 
 def _window(envs: LocomotionVectorEnv, one: Shown) -> tuple[np.ndarray, np.ndarray]:
-    steps = one.episodes.torques.shape[1]
+    steps = int(one.episodes.steps[0])  # its own: others may last longer
     last = np.arange(max(0, steps - round(WINDOW / envs.dt)), steps + 1)
     return last * envs.dt, last

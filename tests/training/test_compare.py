@@ -18,10 +18,10 @@ import training.evaluate
 from training import config
 from training.compare import Compare, compare, judge, strongest_known
 from training.config import EVALUATION_SEEDS, EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
-from training.evaluate import load_policy, make_envs, recorded, rollout
+from training.evaluate import Rollout, load_policy, make_envs, recorded, rollout
 from training.metrics import measure
 from training.optimal import reference
-from training.plots import median_and_range
+from training.plots import GAITS, POLICY, Shown, draw, median_and_range
 from training.progress import Job, run_jobs
 from training.report import markdown
 
@@ -229,3 +229,21 @@ def test_ctrl_c_keeps_what_is_done(tmp_path):
     assert b"interrupted; the same command goes on" in errors
     (checkpoint,) = tmp_path.rglob("*.checkpoint")
     assert checkpoint.stat().st_size > 0
+
+
+def test_a_figure_shows_each_episode_up_to_its_own_end(tmp_path, monkeypatch):
+    """Episodes of a goal do not last equally long, and of a thousand the first is seldom the longest."""
+    shown = []
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, *_, **__: shown.extend(figure.axes))
+    envs = make_envs(SNAKEBOARD, 1, backend="numpy")
+
+    def one(steps, longest):
+        q = np.random.default_rng(0).normal(size=(2, longest + 1, 5))
+        ends = np.array([steps, longest])
+        return Rollout(np.zeros(2), q, np.zeros((2, longest, 2)), np.zeros((2, longest + 1, 3)), ends, {}, {})
+
+    curve = [{"steps": steps, "cpu_s": steps, "distance_m": 1.0} for steps in (0, 10)]
+    two = [Shown("gait", GAITS[0], one(20, 50)), Shown("policy", POLICY, one(30, 90))]
+    draw(tmp_path / "figure.png", "title", envs, two, [curve], {"gait": 1.0})
+    last = [max(line.get_xdata().max() for line in ax.lines) for ax in shown if "last" in ax.get_title()]
+    assert last == pytest.approx([20 * envs.dt, 30 * envs.dt])
