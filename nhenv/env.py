@@ -142,10 +142,10 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         frame: frame in which the equations are integrated; None for the one that computes best.
         integrator: "auto", or a method of `mechanics.compiler.integrators`.
         substeps: steps of the method in a control period; None for the default.
-        tolerance: largest error of a step of the integrator, by the method's own estimate: of a state z, tolerance
-            (1 + |z|). A control period that is estimated to be worse is halved until it is not, and the errors of its
-            parts add up; where nothing helps, the episode ends with info["diverged"]. None: 1e-10 with integrator
-            "auto", no control with one that is named.
+        tolerance: largest error of a control period, by the method's own estimate: of a state z, tolerance (1 + |z|).
+            One that is estimated to be worse is halved until it is not. Each part may take its share of the tolerance
+            (all of it with an integrator that is named), and less near a pole of the frame; where nothing helps, the
+            episode ends with info["diverged"]. None: 1e-10 with integrator "auto", no control with one that is named.
         keep_energy: whether every step of the method ends by scaling the pseudo-velocities, by 1 up to the step's own
             error, so that the energy changes by the work of the held torques and, but for roundings, by nothing else:
             for long unforced runs. Stops still take energy away. Needs controls with constant covectors, such as

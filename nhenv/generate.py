@@ -71,8 +71,21 @@ class Generator:
         self.method, self.substeps = self._method()
         self.controlled = scene.tolerance < inf  # then a flight may turn out not to be right
         self.trust = self._trust() if self.controlled else {}
+        # A hold may be wrong by the tolerance, however many flights it takes. Estimates of a low order, as some methods
+        # have that are asked for by name, would make them too many.
+        shared = self.controlled and scene.integrator == "auto"
+        self.pace = {"pace": self.substeps / sp.Symbol("dt")} if shared else {}
         self.events = bool(self.joints) or self.controlled  # so that a hold may take more than one flight
-        texts = {**observation, **judgement, **ending, **self.motion, **self.rules, **self.energy, **self.trust}
+        texts = {
+            **observation,
+            **judgement,
+            **ending,
+            **self.motion,
+            **self.rules,
+            **self.energy,
+            **self.trust,
+            **self.pace,
+        }
         self.program = Program(
             {**integrated(self.flow), **texts}, [sp.Symbol(name) for name in scene.parameters], equations.definitions
         )
@@ -213,6 +226,7 @@ class Generator:
             self.scene.tolerance,
             self.speeds,
             list(self.trust),
+            *self.pace,
         )
 
     def _clear_joints(self, backend: Backend) -> str:

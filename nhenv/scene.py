@@ -58,8 +58,9 @@ class Scene:
         drag: whether the mechanism's drag acts; if not, the kernel is that of a mechanism without any.
         integrator: name of a method, or "auto".
         substeps: steps of the method in a hold; None for the default.
-        tolerance: what no flight may get wrong by the method's own estimate, of a state z in (1 + |z|); a hold is
-            divided into as many flights as that takes. Infinite: whatever the method gives.
+        tolerance: what no hold may get wrong by the method's own estimate, of a state z in (1 + |z|); it is divided
+            into as many flights as that takes, each with its share if the integrator is "auto". Infinite: whatever the
+            method gives.
         keep_energy: whether every step of the method ends with velocities that have the energy which the held controls
             and the potential leave them.
         backend: "numba" or "numpy".

@@ -26,6 +26,9 @@ __all__ = ["Program", "integrated", "needed", "operation_count"]
 # In rad, within a step: beyond this, errors may be aliased, and so escape the estimate.
 LARGEST_TURN = 1.5
 
+# Of the tolerance, a substep may use this however short it is: less could not be had where motions are very fast.
+LEAST_PART = 1 / 64
+
 # Kept energy moves no velocity by more than this, in errors that the tolerance allows. Where hardly any kinetic energy
 # is left to be corrected, a correction would do more harm than good; elsewhere, a step that is right needs one at most.
 LARGEST_CORRECTION = 10.0
@@ -174,13 +177,15 @@ class Program:
         tolerance: float = inf,
         speeds: Sequence[sp.Symbol] = (),
         trust: Sequence[str] = (),
+        pace: str = "",
     ) -> str:
         """Source of `name(_h, *states, *carried, *held, _k)` -> states after _h seconds, and whether they are right.
 
         They are if no substep, by the method's own estimate, makes a state z wrong by more than `tolerance` (1 + |z|),
         or turns an angle so far that the estimate might be deceived; always, and unchecked, if that is infinite.
         Of the tolerance, the square of the least of the outputs `trust` at a substep's first and last node may be used,
-        all of it above 1, none if that is not positive.
+        all of it above 1, none if that is not positive. If there is an output `pace`, no more may be used than it says
+        for a second, but for very short substeps: then errors of many add up to the tolerance.
 
         With several streams, of one that takes these arguments for one system after the other, and does every
         operation for one after the other: what one waits for, another uses the time of.
@@ -235,8 +240,13 @@ class Program:
         right = ["_right"] * (substeps > 1)
         if estimated:
             limits = list(map(repr, method.thresholds(tolerance)))
-            if trust:
-                limits = self._trusted(body, limits, trust, (stages[0], stages[-1]))
+            shares = [self._trusted(body, trust, (stages[0], stages[-1]))] * bool(trust)
+            if pace:
+                part = body.assign("_pace", f"_h*{body.value(self.outputs[pace], start)}")
+                shares.append(body.assign("_part", f"{part} if {part} > {LEAST_PART!r} else {LEAST_PART!r}"))
+            if shares:
+                least = body.assign("_least", " if {0} < {1} else ".join(shares).format(*shares))
+                limits = [body.assign(f"_limit{i}", f"{limit}*{least}") for i, limit in enumerate(limits)]
             for (state, which), error in errors.items():
                 bound = backend.sum_of_products([(limits[which], f"fabs({end[state]})")], limits[which])
                 right.append(f"(fabs({error}) <= {bound})")
@@ -263,15 +273,15 @@ class Program:
         lines = [*self._unpack(body), *lines, f"return ({''.join(f'{n}, ' for n in names)})"]
         return _function(name, [*arguments, "_k"], lines, backend.decorator)
 
-    def _trusted(self, body: _Body, limits: Sequence[str], trust: Sequence[str], nodes: Sequence[_Stage]) -> list[str]:
-        """Lines that find out how much of some limits may be used, and the names of what is left."""
+    def _trusted(self, body: _Body, trust: Sequence[str], nodes: Sequence[_Stage]) -> str:
+        """Lines that find out how much of a tolerance may be used, and the name of that."""
         share = "1.0"
         for name in trust:
             for node in nodes:
                 value = body.assign(f"_{name.replace(':', '')}{node.suffix}", body.value(self.outputs[name], node))
+                # Numba's `min` is careful about what is not a number, and slow.
                 share = body.assign(f"_share{value}", f"{value} if {value} < {share} else {share}")
-        square = body.assign("_square", f"{share}*fabs({share})")
-        return [body.assign(f"_limit{i}", f"{limit}*{square}") for i, limit in enumerate(limits)]
+        return body.assign("_square", f"{share}*fabs({share})")
 
     def _energy_kept(
         self,

@@ -41,9 +41,9 @@ class Method:
         c: [s] nodes, as fractions of the step.
         order: the error of one step of length h is O(h^(order + 1)).
         source: where the coefficients come from.
-        safety: how much larger the error may be than its estimates lead to expect, see `thresholds`. Measured on 33,000
-            states that gaits, relays and random actions reach, with and without stops: of the snakeboard's one had an
-            error above the tolerance, by 40 %, of the racer's none.
+        safety: how much larger the error may be than its estimates lead to expect, see `thresholds`. Measured on 90,000
+            holds from states that gaits, relays and random actions reach: with stops none was wrong by more than 7e-11
+            at a tolerance of 1e-10, without them two of the snakeboard's, by 5e-10 at 40 rad/s.
     """
 
     name: str
@@ -229,7 +229,7 @@ def _verner9() -> Method:
 
     a = tuple(spread(*rows.get(stage, ((), ()))) for stage in range(1, len(nodes) + 1))
     source = "Verner, Numerically optimal Runge-Kutta pairs with interpolants, 2010: the most efficient 9(8) pair"
-    return Method("verner9", a, spread(*end), nodes, 9, source, safety=5.0)
+    return Method("verner9", a, spread(*end), nodes, 9, source, safety=25.0)
 
 
 def _collocation(name: str, polynomial: Callable[[Any], Any], degree: int, order: int, source: str) -> Method:

@@ -254,7 +254,7 @@ def test_a_step_whose_estimate_is_below_the_threshold_is_right(name, tolerance):
             h *= 0.8
         end = solve_ivp(function, (0, h), start, "DOP853", rtol=3e-14, atol=1e-15).y[:, -1]
         worst = max(worst, np.abs(_pendulum_step(name, h, start)[0] - end).max())
-    # The safety that a threshold allows for is a factor of 100, of 5 for Verner; a pendulum needs little of it. The
+    # The safety that a threshold allows for is a factor of 100, of 25 for Verner; a pendulum needs little of it. The
     # lower bound is where the reference ends, or the steps for which h = 1 is short.
     assert min(1e-4 * tolerance, 1e-14) < worst <= tolerance
 
