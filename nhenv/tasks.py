@@ -314,7 +314,7 @@ TASKS: tuple[Task, ...] = (
         weights={
             "heading_cost_weight": 1.0,
             "offset_cost_weight": 0.5,
-            "arrival_reward_weight": 0.5,
+            "arrival_reward_weight": 1.0,
             "ctrl_cost_weight": 0.02,
             "heading_tolerance": 0.15,
             "offset_tolerance": 0.15,

@@ -274,13 +274,13 @@ CONFIGS: dict[str, TaskConfig] = {
             # To a goal behind it goes backwards, if the mechanism can.
             "steered either way": _gait(steered=True, steered_by="goal_left", limited_by="goal_ahead"),
         },
-        ppo=_VARIED,
+        ppo=dataclasses.replace(_VARIED, entropy=(0.02, 0.0)),
         evaluation=_JUDGED_OFTEN,
     ),
     # Ostrowski's gaits: what is left to turn, or to go sideways, decides how large they are and which way they work.
     "Turn": TaskConfig(
         gaits={"sinusoid 2:1": _gait(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")},
-        ppo=dataclasses.replace(_VARIED, timesteps=3_000_000, entropy=(0.02, 0.0), start_offset=0.3),
+        ppo=dataclasses.replace(_VARIED, timesteps=3_000_000, entropy=(0.04, 0.0), start_offset=0.3),
         evaluation=_JUDGED_OFTEN,
     ),
     "Park": TaskConfig(
@@ -290,7 +290,7 @@ CONFIGS: dict[str, TaskConfig] = {
                 cyclic_ratio=1.5, limited_by="place_left", gain=20.0, steered=True, steered_by="sin_to_turn"
             ),
         },
-        ppo=dataclasses.replace(_VARIED, reward_scale=0.05, start_offset=0.3),
+        ppo=dataclasses.replace(_VARIED, timesteps=2_000_000, reward_scale=0.05, start_offset=0.3),
         evaluation=_JUDGED_OFTEN,
     ),
 }

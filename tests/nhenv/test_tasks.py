@@ -241,8 +241,9 @@ def _apart(env, target_heading):
 
 def test_reward_and_observation_of_the_turn_task(make_task, actions):
     env = make_task(
-        "snakeboard", "Turn", ctrl_cost_weight=0.3, offset_cost_weight=0.7, heading_tolerance=0.8, offset_tolerance=0.2
-    )
+        "snakeboard", "Turn", ctrl_cost_weight=0.3, offset_cost_weight=0.7, heading_tolerance=0.8, offset_tolerance=0.2,
+        arrival_reward_weight=0.4,
+    )  # fmt: skip
     # Half a turn away, so that the angle still to turn crosses the cut at ±π.
     env.reset(seed=4, options={"q": [0.3, -0.2, 2.9, 0.1, 0.0], "target": {"turn_size": np.pi, "turn_side": 0.2}})
     assert env.targets == {"target_heading": 2.9 + np.pi, "start_x": 0.3, "start_y": -0.2}
@@ -258,7 +259,7 @@ def test_reward_and_observation_of_the_turn_task(make_task, actions):
         assert info["reward_heading"] == pytest.approx(-abs(e) / np.pi, abs=1e-14)
         assert info["reward_offset"] == pytest.approx(-0.7 * abs(offset), rel=1e-12, abs=1e-15)
         # an exponent of tens
-        arrival = 0.5 * np.exp(-((e / 0.8) ** 2) - (abs(offset) / 0.2) ** 2)
+        arrival = 0.4 * np.exp(-((e / 0.8) ** 2) - (abs(offset) / 0.2) ** 2)
         assert info["reward_arrival"] == pytest.approx(arrival, rel=1e-10)
         assert info["reward_ctrl"] == pytest.approx(-0.3 * np.mean(action.astype(float) ** 2), rel=1e-14)
         assert reward == sum(info[key] for key in info if key.startswith("reward_"))
