@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import reduce
 from math import inf
 from operator import methodcaller
 
@@ -240,12 +241,14 @@ class Program:
         right = ["_right"] * (substeps > 1)
         if estimated:
             limits = list(map(repr, method.thresholds(tolerance)))
-            shares = [self._trusted(body, trust, (stages[0], stages[-1]))] * bool(trust)
+            shares = []
+            if trust:
+                shares.append(self._trusted(body, trust, (stages[0], stages[-1])))
             if pace:
                 part = body.assign("_pace", f"_h*{body.value(self.outputs[pace], start)}")
                 shares.append(body.assign("_part", f"{part} if {part} > {LEAST_PART!r} else {LEAST_PART!r}"))
             if shares:
-                least = body.assign("_least", " if {0} < {1} else ".join(shares).format(*shares))
+                least = body.assign("_least", reduce(_smaller, shares))
                 limits = [body.assign(f"_limit{i}", f"{limit}*{least}") for i, limit in enumerate(limits)]
             for (state, which), error in errors.items():
                 bound = backend.sum_of_products([(limits[which], f"fabs({end[state]})")], limits[which])
@@ -279,8 +282,7 @@ class Program:
         for name in trust:
             for node in nodes:
                 value = body.assign(f"_{name.replace(':', '')}{node.suffix}", body.value(self.outputs[name], node))
-                # Numba's `min` is careful about what is not a number, and slow.
-                share = body.assign(f"_share{value}", f"{value} if {value} < {share} else {share}")
+                share = body.assign(f"_share{value}", _smaller(value, share))
         return body.assign("_square", f"{share}*fabs({share})")
 
     def _energy_kept(
@@ -621,6 +623,11 @@ def _renamer(names: Iterable[str]) -> Callable[[str, int], str]:
 
 def _function(name: str, arguments: Sequence[str], lines: Sequence[str], decorator: str) -> str:
     return f"{decorator}def {name}({', '.join(arguments)}):\n" + _indent("\n".join(lines)) + "\n"
+
+
+def _smaller(a: str, b: str) -> str:
+    """The smaller of two numbers: Numba's `min` is careful about what is not a number, and slow."""
+    return f"{a} if {a} < {b} else {b}"
 
 
 def _indent(text: str) -> str:

@@ -104,7 +104,7 @@ def test_a_smaller_tolerance_means_a_smaller_error(bare):
                 env.step(action)
                 error, turn = _error(env, q, v, env.torque_limits * action)
                 errors.append(error)
-                # As above; the stranger itself is good to 1e-12.
+                # Estimates are less sure of larger tolerances; the stranger itself is good to 1e-12.
                 assert error < 3 * tolerance * (1 + turn) + 3e-12
             worst.append(max(errors))
         # Below 1e-12, the stranger's error hides what is left.
