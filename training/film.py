@@ -28,13 +28,12 @@ from scipy.spatial import cKDTree
 from nhenv import render
 from nhenv.canvas import Canvas
 from nhenv.vector_env import LocomotionVectorEnv
-from training import policies
+from training.actors import Actor, actors_of, random_actor
 from training.config import EVALUATION_SEEDS
-from training.evaluate import Controller, load_policy, rollout
-from training.store import read_json, write_bytes
-from training.tuning import controller, search_config
+from training.evaluate import rollout
+from training.store import write_bytes
 
-__all__ = ["Actor", "Film", "Take", "actor", "actors_of", "film", "frames", "gif", "mp4", "random_actor", "record"]
+__all__ = ["Film", "Take", "film", "frames", "gif", "mp4", "record"]
 
 Pixels = NDArray[np.uint8]
 
@@ -43,23 +42,6 @@ TRAILS = ("blue", "orange", "green", "purple")
 SHIFT = 2  # bits of a colour that make no difference to a GIF
 STRIP = 56  # height in pixels of the strip that shows who is where
 GAP = 4
-
-
-@dataclass(frozen=True)
-class Actor:
-    """Who appears in a film.
-
-    Attributes:
-        label: what the film calls it.
-        env_id: environment.
-        env_kwargs: arguments of the environment, as plain data.
-        make: controller for environments.
-    """
-
-    label: str
-    env_id: str
-    env_kwargs: Mapping[str, Any]
-    make: Callable[[LocomotionVectorEnv], Controller]
 
 
 @dataclass(frozen=True)
@@ -77,72 +59,6 @@ class Take:
     q: NDArray[np.float64]
     marker: Mapping[str, float]
     envs: LocomotionVectorEnv
-
-
-class _Random:
-    """Uniform actions, the same for everybody."""
-
-    def __init__(self, envs: LocomotionVectorEnv) -> None:
-        self._shape = envs.action_space.shape
-        self.reset(0)
-
-    def reset(self, episodes: int) -> None:
-        """Begin again."""
-        self._rng = np.random.default_rng(0)
-
-    def __call__(self, observations: NDArray[np.float32], /) -> NDArray[np.float32]:
-        """Actions (N, m)."""
-        return self._rng.uniform(-1, 1, self._shape).astype(np.float32)
-
-
-def actor(path: Path, label: str | None = None) -> Actor:
-    """What a file holds: a tuned gait (JSON), or a policy (.safetensors, .zip, or the JSON beside a zip file).
-
-    Loading a zip file unpickles it: only load what you trust.
-    """
-    if path.suffix == policies.SUFFIX:
-        policy = policies.load(path)
-        return Actor(label or "PPO", policy.card["env_id"], policy.card["env_kwargs"], lambda envs: policy)
-    beside = path.with_suffix(".json")
-    for file in (path, beside):
-        if not file.is_file():
-            raise ValueError(f"there is no {file}; training.compare writes gait-*.json, ppo-*.zip and ppo-*.json")
-    piece = read_json(beside)
-    settings, result = piece["settings"], piece["result"]
-    for kind, read in _KINDS.items():
-        if kind in settings:
-            name, make = read(path, settings, result)
-            return Actor(label or name, settings["env_id"], settings[kind].get("env_kwargs", {}), make)
-    raise ValueError(f"{beside} is of neither kind that can be filmed: {', '.join(_KINDS)}")
-
-
-def actors_of(pieces: Sequence[Path], labels: Sequence[str]) -> list[Actor]:
-    """Actors of files, which must be of one environment; the first of them are called by `labels`."""
-    actors = [actor(path, label) for path, label in itertools.zip_longest(pieces, labels[: len(pieces)])]
-    env_ids = dict.fromkeys(one.env_id for one in actors)
-    if len(env_ids) > 1:
-        raise ValueError(f"only controllers of one environment go together, not of {' and '.join(env_ids)}")
-    return actors
-
-
-_Read = tuple[str, Callable[[LocomotionVectorEnv], Controller]]
-
-
-def _gait(path: Path, settings: Mapping[str, Any], result: Mapping[str, Any]) -> _Read:
-    config = search_config(settings)
-    return config.label, lambda envs: controller(envs, config, result["vector"])
-
-
-def _policy(path: Path, settings: Mapping[str, Any], result: Mapping[str, Any]) -> _Read:
-    return f"PPO, seed {settings['seed']}", lambda envs: load_policy(path.with_suffix(".zip"))
-
-
-_KINDS: dict[str, Callable[[Path, Mapping[str, Any], Mapping[str, Any]], _Read]] = {"gait": _gait, "ppo": _policy}
-
-
-def random_actor(env_id: str, label: str | None = None) -> Actor:
-    """Random actions in an environment, whatever its task."""
-    return Actor(label or "random actions", env_id, {}, _Random)
 
 
 def record(actor: Actor, seed: int, **options: Any) -> Take:
@@ -360,14 +276,7 @@ class Film:
         """Who is filmed."""
         if self.env_id is not None:
             return [random_actor(self.env_id, next(iter(self.labels), None))]
-        actors = actors_of(self.pieces, self.labels)
-        for other in actors[1:]:
-            if self.drag is None and other.env_kwargs != actors[0].env_kwargs:
-                raise ValueError(
-                    f"{actors[0].label} was made for {dict(actors[0].env_kwargs)}, {other.label} for "
-                    f"{dict(other.env_kwargs)}: say --drag True or --drag False"
-                )
-        return actors
+        return actors_of(self.pieces, self.labels, same_arguments=self.drag is None)
 
 
 def film(options: Film, console: Console) -> None:

@@ -21,8 +21,9 @@ from rich.console import Console
 from scipy.interpolate import CubicSpline
 
 from mechanics.geometry.local_connection import height_functions, shape_coordinates
+from training.actors import actors_of
 from training.config import EVALUATION_SEEDS
-from training.film import Take, actors_of, record
+from training.film import Take, record
 from training.plots import mathtext
 from training.store import write_bytes
 

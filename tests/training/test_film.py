@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import subprocess
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -13,10 +14,11 @@ from rich.console import Console
 
 from nhenv import render
 from training import film as films
+from training.actors import random_actor
 from training.config import EVALUATION_SEEDS
-from training.film import TRAILS, Film, actor, film, frames, gif, length, mp4, random_actor, record
-from training.policies import SHIPPED, SUFFIX, load, shipped
-from training.store import settings, write_json
+from training.film import TRAILS, Film, film, frames, gif, length, mp4, record
+from training.policies import SHIPPED, SUFFIX
+from training.store import settings
 
 RACER, GOAL = "nhenv/RollerRacerForward-v0", "nhenv/RollerRacerGoal-v0"
 SIZE = {"width": 160, "height": 80}
@@ -169,65 +171,23 @@ def test_a_film_is_written_whole_or_not_at_all(take, tmp_path, monkeypatch):
     assert [path.name for path in options.out.parent.iterdir()] == ["film.gif"]
 
 
-# -- who is filmed ------------------------------------------------------------------------------
-
-
-def piece(path, env_id=RACER, **settings):
-    write_json(path, {"settings": {"env_id": env_id, **settings}, "result": {"vector": [0.6, 0.0, 8.0, 6.0]}})
-    return path
-
-
-GAIT = {"env_kwargs": {}, "steered": False}
-
-
-def test_a_gait_is_an_actor(tmp_path):
-    one = actor(piece(tmp_path / "gait-0.json", gait=GAIT))
-    assert (one.label, one.env_id, one.env_kwargs) == ("sinusoid", RACER, {})
-    take = record(one, EVALUATION_SEEDS, backend="numpy", max_episode_steps=5)
-    assert np.isfinite(take.q).all()
-    assert np.ptp(take.q[:, 3]) > 0.01
-    assert actor(piece(tmp_path / "gait-1.json", gait=GAIT | {"steered": True})).label == "steered sinusoid"
-    assert actor(tmp_path / "gait-1.json", "the best").label == "the best"
-
-
-def test_a_policy_is_an_actor(tmp_path):
-    (tmp_path / "ppo-seed3.zip").touch()
-    piece(tmp_path / "ppo-seed3.json", ppo={"env_kwargs": {"drag": True}}, seed=3)
-    one = actor(tmp_path / "ppo-seed3.zip")
-    assert (one.label, one.env_kwargs) == ("PPO, seed 3", {"drag": True})
-
-
-def test_a_shipped_policy_is_an_actor():
-    policy = load(shipped()[0])
-    one = actor(SHIPPED / f"{shipped()[0]}{SUFFIX}")
-    assert (one.env_id, one.env_kwargs) == (policy.card["env_id"], policy.card["env_kwargs"])
-    seen = np.ones(len(policy.card["observation"]), np.float32)
-    assert np.array_equal(one.make(None)(seen), policy(seen))
-
-
-def test_impossible_films(tmp_path):
-    gait = piece(tmp_path / "gait-0.json", gait=GAIT)
-    other = piece(tmp_path / "gait-1.json", env_id=GOAL, gait=GAIT)
-    dragged = piece(tmp_path / "gait-2.json", gait=GAIT | {"env_kwargs": {"drag": True}})
+def test_impossible_films():
     for options, reason in (
         ({}, "say what to film"),
-        ({"env_id": RACER, "pieces": (gait,)}, "--env-id is for random actions"),
-        ({"env_id": RACER, "out": tmp_path / "film.avi"}, r"ends in \.gif or \.mp4"),
+        ({"env_id": RACER, "pieces": (Path("gait-0.json"),)}, "--env-id is for random actions"),
+        ({"env_id": RACER, "out": Path("film.avi")}, r"ends in \.gif or \.mp4"),
         ({"env_id": RACER, "labels": ("a", "b")}, "2 labels for 1 controllers"),
         ({"env_id": RACER, "speed": 0.0}, "speed must be positive"),
     ):
         with pytest.raises(ValueError, match=reason):
             Film(**options)
-    for pieces, reason in (
-        ((gait, other), f"not of {RACER} and {GOAL}"),
-        ((gait, dragged), "say --drag True or --drag False"),
-        ((tmp_path / "none.zip",), "there is no .*none.zip; training.compare writes"),
-    ):
-        with pytest.raises(ValueError, match=reason):
-            Film(pieces=pieces).actors()
-    assert len(Film(pieces=(gait, dragged), drag=True).actors()) == 2
-    with pytest.raises(ValueError, match="neither kind that can be filmed: gait, ppo"):
-        actor(piece(tmp_path / "sweep.json", sweep={}))
+
+
+def test_only_a_film_that_says_the_drag_shows_controllers_made_for_another():
+    pieces = tuple(SHIPPED / f"{name}{SUFFIX}" for name in ("RollerRacerForward-v0", "RollerRacerForward-v0-drag"))
+    with pytest.raises(ValueError, match="if --drag says in which"):
+        Film(pieces=pieces).actors()
+    assert len(Film(pieces=pieces, drag=True).actors()) == 2
 
 
 def test_the_command_shows_its_options(monkeypatch, capsys):

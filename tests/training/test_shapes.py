@@ -62,7 +62,7 @@ def test_a_figure(take, monkeypatch):
 
 
 def test_the_command(take, tmp_path, monkeypatch):
-    monkeypatch.setattr("training.film.actor", lambda path, label: Named(str(path)))
+    monkeypatch.setattr("training.actors.actor", lambda path, label: Named(str(path)))
     monkeypatch.setattr(figures, "record", lambda one, seed: dataclasses.replace(take, label=one.env_id))
     options = Shapes(pieces=("a", "a"), out=tmp_path / "shapes.png", first=2, last=8)
     shapes(options, Console(file=io.StringIO()))
@@ -79,3 +79,4 @@ def test_the_command(take, tmp_path, monkeypatch):
 @dataclasses.dataclass
 class Named:
     env_id: str
+    env_kwargs: dict = dataclasses.field(default_factory=dict)
