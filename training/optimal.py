@@ -3,11 +3,13 @@
 python -m training.optimal --replay      # what is known, replayed in the environments
 python -m training.optimal               # look on from there, in parallel; Ctrl-C keeps what was found
 python -m training.optimal --fresh --out runs/optimal    # find it again from nothing
+python -m training.optimal --starts runs/compare/SnakeboardForward-v0/*.json    # begin with what these drive as well
 
 An episode is one function of its T·m actions. `training.climbing` climbs it by sequential linear programming through
 the simulator; then a stretch of the actions is changed at random and climbs again, and the best is kept. The first
-start is what is known, or the best of a family of torques that hold still, then swing, by differential evolution. What
-is found is a lower bound of what is possible: no proof says that there is nothing better.
+starts are what is known, or the best of a family of torques that hold still, then swing, by differential evolution, and
+what gaits, laws and policies do from rest. What is found is a lower bound of what is possible: no proof says that there
+is nothing better.
 
 Every episode begins at rest with all angles at zero, the middle of the environment's starts. The files hold float32
 actions, as the environment takes them, and the distance that these reach in it.
@@ -18,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +33,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import Bounds
 
+from training.actors import Actor, actor
 from training.climbing import TRIALS, climb
 from training.config import COMPARED, check_env_id
 from training.evaluate import make_envs
@@ -39,7 +42,7 @@ from training.progress import Job, Report, ignore, run_jobs
 from training.shooting import Shooting
 from training.store import read_json, versions, write_json
 
-__all__ = ["FOLDER", "Optimal", "Reference", "load", "path_of", "reference", "replay", "search", "swings"]
+__all__ = ["FOLDER", "Optimal", "Reference", "driven", "load", "path_of", "reference", "replay", "search", "swings"]
 
 Array = NDArray[np.float64]
 
@@ -180,62 +183,93 @@ class _Hop:
 def search(
     env_id: str,
     drag: bool,
-    start: ArrayLike,
+    starts: Mapping[str, ArrayLike],
     *,
     hops: int = 0,
     rounds: int = 60,
     seed: int = 0,
-    found: Callable[[float, NDArray[np.float32]], None] = lambda distance, actions: None,
+    found: Callable[[float, NDArray[np.float32], str], None] = lambda distance, actions, start: None,
     report: Report = ignore,
 ) -> tuple[float, NDArray[np.float32]]:
-    """Climb from given actions, and hop on from there: the distance reached, and the float32 actions that do it.
+    """Climb from given actions, and hop on from the best: the distance reached, and the float32 actions that do it.
 
     Args:
         env_id: environment.
         drag: whether the mechanism's drag acts.
-        start: actions (T, m).
-        hops: changes to be tried after the first climb.
+        starts: by name, actions (T, m); at least one. What the first reaches as it is counts as known.
+        hops: changes to be tried after the climbs from the starts.
         rounds: of each climb, at most.
         seed: of the changes.
-        found: hears of every improvement.
+        found: hears of every improvement on what is known, and from which start it came.
         report: hears of every climb.
     """
     shooting, rng = Shooting(env_id, trials=TRIALS, drag=drag), np.random.default_rng(seed)
     hop = _Hop(shooting.shape, rng)
-    best_actions = np.asarray(start, np.float32)
+    origin, first = next(iter(starts.items()))
+    best_actions = np.asarray(first, np.float32)
     best = shooting.distance(best_actions)
-    trial = best_actions.astype(float)
-    for number in range(hops + 1):
-        actions = climb(shooting, trial, rounds)[1].astype(np.float32)
+    count = len(starts) + hops
+    for number in range(count):
+        if number < len(starts):
+            name, trial = list(starts.items())[number]
+        else:
+            name, trial = origin, hop(best_actions.astype(float))
+        actions = climb(shooting, np.asarray(trial, float), rounds)[1].astype(np.float32)
         distance = shooting.distance(actions)  # as it is written down, and as it is replayed
         if distance > best:
-            best, best_actions = distance, actions
-            found(best, best_actions)
-        report(number + 1, hops + 1, f"{best:.3f} m")
-        trial = hop(best_actions.astype(float))
+            best, best_actions, origin = distance, actions, name
+            found(best, best_actions, origin)
+        report(number + 1, count, f"{best:.3f} m")
     return best, best_actions
 
 
+def driven(one: Actor, drag: bool) -> NDArray[np.float32]:
+    """Actions (T, m) of a controller from rest with all coordinates at zero."""
+    envs = make_envs(one.env_id, 1, drag=drag, whole_state=True)
+    drives = one.make(envs)
+    drives.reset(1)
+    steps = envs.max_episode_steps
+    assert steps is not None
+    observations, _ = envs.reset(options={"q": np.zeros(envs.mechanism.n)})
+    actions = []
+    for _ in range(steps):
+        actions.append(np.clip(drives(observations), -1, 1))
+        observations, *_ = envs.step(actions[-1])
+    return np.concatenate(actions).astype(np.float32)
+
+
 def improve(
-    env_id: str, drag: bool, *, hops: int, seed: int, fresh: bool, folder: Path, report: Report = ignore
+    env_id: str,
+    drag: bool,
+    *,
+    hops: int,
+    seed: int,
+    fresh: bool,
+    folder: Path,
+    starts: Sequence[Path] = (),
+    report: Report = ignore,
 ) -> None:
     """Look for a better reference, and write every one that is found into the folder at once."""
     path = path_of(env_id, drag, folder)
     known = load(env_id, drag, folder) or (None if fresh else load(env_id, drag))
     began = time.process_time()
-    start: ArrayLike
-    before: dict[str, Any]
     if known is None:
-        start, before = _best_swings(env_id, drag, seed, report), {"start": "the best of training.optimal.swings"}
+        swung = "the best of training.optimal.swings"
+        tried: dict[str, ArrayLike] = {swung: _best_swings(env_id, drag, seed, report)}
+        spent = 0.0
     else:
-        start, before = known.actions, dict(known.found)
+        tried, spent = {known.found["start"]: known.actions}, known.found.get("cpu_s", 0.0)
+    for file in starts:
+        one = actor(file)
+        if (one.env_id, one.env_kwargs.get("drag", False)) == (env_id, drag):
+            tried[f"{one.label} ({file.name})"] = driven(one, drag)
 
-    def found(distance: float, actions: NDArray[np.float32]) -> None:
-        how = {**before, "climbed": "training.climbing", "versions": versions()}
-        how["cpu_s"] = before.get("cpu_s", 0.0) + time.process_time() - began
+    def found(distance: float, actions: NDArray[np.float32], start: str) -> None:
+        cpu_s = spent + time.process_time() - began
+        how = {"start": start, "climbed": "training.climbing", "versions": versions(), "cpu_s": cpu_s}
         Reference(env_id=env_id, drag=drag, distance_m=distance, actions=actions, found=how).write(path)
 
-    search(env_id, drag, start, hops=hops, seed=seed, found=found, report=report)
+    search(env_id, drag, tried, hops=hops, seed=seed, found=found, report=report)
 
 
 # -- the command -----------------------------------------------------------------------------------
@@ -248,9 +282,11 @@ class Optimal:
     Attributes:
         env_ids: environments.
         drag: with drag or without; None for both.
-        hops: changes to be tried in each.
+        hops: changes to be tried in each; 0 to climb from the starts alone.
         seed: of the search; another one tries others.
         fresh: begin with nothing instead of with what is known, unless the folder holds some.
+        starts: gait-*.json, ppo-*.json or *.safetensors, to begin with what these do as well; each in the environment
+            for which it was made. Loading a policy's zip file unpickles it: only name files that you trust.
         out: folder of the references that are read and written.
         processes: processes side by side.
         replay: only replay what the folder holds.
@@ -261,6 +297,7 @@ class Optimal:
     hops: int = 100
     seed: int = 0
     fresh: bool = False
+    starts: tuple[Path, ...] = ()
     out: Path = FOLDER
     processes: int = 1
     replay: bool = False
@@ -268,8 +305,13 @@ class Optimal:
     def __post_init__(self) -> None:
         for env_id in self.env_ids:
             check_env_id(env_id)
-        if self.hops < 1 or self.processes < 1:
-            raise ValueError(f"hops and processes must be at least 1, got {self.hops} and {self.processes}")
+        if self.hops < 0 or self.processes < 1:
+            raise ValueError(f"hops must be at least 0 and processes at least 1, got {self.hops} and {self.processes}")
+        for one in map(actor, self.starts):
+            if (one.env_id, one.env_kwargs.get("drag", False)) not in self.cells:
+                raise ValueError(
+                    f"{one.label} drives {one.env_id} with {dict(one.env_kwargs)}, which is not among what is searched"
+                )
 
     @property
     def cells(self) -> list[tuple[str, bool]]:
@@ -299,7 +341,14 @@ def main(options: Optimal) -> None:
     console = Console()
     jobs = []
     if not options.replay:
-        better = partial(improve, hops=options.hops, seed=options.seed, fresh=options.fresh, folder=options.out)
+        better = partial(
+            improve,
+            hops=options.hops,
+            seed=options.seed,
+            fresh=options.fresh,
+            folder=options.out,
+            starts=options.starts,
+        )
         for env_id, drag in options.cells:
             label = f"{env_id.rpartition('/')[2]}{', drag' if drag else ''}"
             jobs.append(Job(label, better, (env_id, drag)))

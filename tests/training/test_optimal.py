@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from training import optimal
+from training.actors import actor
 from training.config import COMPARED
 from training.evaluate import make_envs
-from training.optimal import FOLDER, Optimal, Reference, improve, load, path_of, reference, replay, search
+from training.optimal import FOLDER, Optimal, Reference, driven, improve, load, path_of, reference, replay, search
+from training.policies import SHIPPED, SUFFIX
 
 CELLS = [(env_id, drag) for env_id in COMPARED for drag in (False, True)]
 SNAKEBOARD, RACER = COMPARED
@@ -84,7 +86,9 @@ def test_reference_survives_its_file_to_the_last_bit(tmp_path):
 def test_search_only_ever_improves():
     start = 0.5 * np.sin(np.arange(300) / 3)[:, None]
     heard = []
-    distance, actions = search(RACER, False, start, hops=2, rounds=8, found=lambda metres, _: heard.append(metres))
+    distance, actions = search(
+        RACER, False, {"sine": start}, hops=2, rounds=8, found=lambda metres, *_: heard.append(metres)
+    )
     before = replay(Reference(env_id=RACER, drag=False, distance_m=0.0, actions=start.astype(np.float32)))
     assert heard == sorted(heard)
     assert heard[-1] == distance > before + 3
@@ -95,13 +99,59 @@ def test_search_only_ever_improves():
 def test_a_climb_that_ends_lower_is_forgotten(monkeypatch):
     tried, known = [], load(RACER, False)
     monkeypatch.setattr(optimal, "climb", lambda shooting, trial, rounds: (tried.append(trial), 0 * trial))
-    distance, actions = search(RACER, False, known.actions, hops=2, found=lambda *what: pytest.fail("it is no gain"))
+    distance, actions = search(
+        RACER, False, {"known": known.actions}, hops=2, found=lambda *what: pytest.fail("it is no gain")
+    )
     np.testing.assert_array_equal(actions, known.actions)
     assert distance == pytest.approx(known.distance_m, abs=1e-3)
     # The first climb is from what was given, the others from what a change has made of it.
     np.testing.assert_array_equal(tried[0], known.actions)
     assert [(trial != known.actions).any() for trial in tried] == [False, True, True]
     assert all((trial == known.actions).any() and np.abs(trial).max() <= 1 for trial in tried)
+
+
+def test_the_best_start_is_climbed_on_from(monkeypatch):
+    tried, heard = [], []
+    known = load(RACER, False).actions
+    monkeypatch.setattr(optimal, "climb", lambda shooting, trial, rounds: (tried.append(trial), trial))
+    starts = {"still": 0 * known, "known": known, "half": known / 2}
+    distance, actions = search(RACER, False, starts, hops=1, found=lambda *what: heard.append(what))
+    np.testing.assert_array_equal(actions, known)
+    assert [(metres, name) for metres, _, name in heard] == [(distance, "known")]
+    for trial, start in zip(tried, starts.values(), strict=False):
+        np.testing.assert_array_equal(trial, start)
+    assert len(tried) == 4
+    # What is changed at random, in a stretch or from somewhere on, is the best of them.
+    assert (tried[3] != known).any()
+    assert (tried[3] == known).mean() > (tried[3] == known / 2).mean()
+
+
+def test_a_policy_drives_from_rest():
+    one = actor(SHIPPED / f"RollerRacerForward-v0{SUFFIX}")
+    actions = driven(one, False)
+    assert (actions.shape, actions.dtype) == ((300, 1), np.float32)
+    assert np.abs(actions).max() <= 1
+    env = gym.make(RACER, backend="numpy")
+    observation, _ = env.reset(options={"q": np.zeros(4)})
+    policy = one.make(None)
+    for action in actions:
+        np.testing.assert_allclose(np.clip(policy(observation[None])[0], -1, 1), action, atol=1e-5)
+        observation, *_ = env.step(action)
+
+
+def test_only_what_was_made_for_a_cell_begins_there(tmp_path, monkeypatch):
+    begun = {}
+    monkeypatch.setattr(optimal, "search", lambda env_id, drag, starts, **others: begun.update({drag: starts}))
+    monkeypatch.setattr(optimal, "driven", lambda one, drag: np.zeros((300, 1), np.float32))
+    files = [SHIPPED / f"RollerRacerForward-v0{drag}{SUFFIX}" for drag in ("", "-drag")]
+    for drag in (False, True):
+        improve(RACER, drag, hops=0, seed=0, fresh=False, folder=tmp_path, starts=files)
+    for drag, file in zip((False, True), files, strict=True):
+        before, own = begun[drag]
+        assert before == load(RACER, drag).found["start"]
+        assert own == f"PPO ({file.name})"
+    with pytest.raises(ValueError, match="which is not among what is searched"):
+        Optimal(starts=files, drag=False)
 
 
 def test_swings_hold_then_swing():
@@ -135,7 +185,7 @@ def test_what_is_known_is_only_replaced_by_better(tmp_path):
 
 def test_a_fresh_search_begins_with_what_the_folder_holds_or_with_swings(tmp_path, monkeypatch):
     begun = []
-    monkeypatch.setattr(optimal, "search", lambda env_id, drag, start, **others: begun.append(np.asarray(start)))
+    monkeypatch.setattr(optimal, "search", lambda env_id, drag, starts, **others: begun.extend(starts.values()))
     monkeypatch.setattr(optimal, "_best_swings", lambda *given: np.full((300, 1), 0.5))
     for fresh in (True, False):
         improve(RACER, False, hops=1, seed=0, fresh=fresh, folder=tmp_path)
@@ -151,7 +201,7 @@ def test_impossible_options_are_refused():
     with pytest.raises(ValueError, match="Did you mean"):
         Optimal(env_ids=("nhenv/SnakebordForward-v0",))
     with pytest.raises(ValueError, match="at least 1"):
-        Optimal(hops=0)
+        Optimal(hops=-1)
 
 
 @pytest.mark.slow
