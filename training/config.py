@@ -280,7 +280,7 @@ CONFIGS: dict[str, TaskConfig] = {
     # Ostrowski's gaits: what is left to turn, or to go sideways, decides how large they are and which way they work.
     "Turn": TaskConfig(
         gaits={"sinusoid 2:1": _gait(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")},
-        ppo=dataclasses.replace(_VARIED, timesteps=3_000_000, entropy=(0.04, 0.0), start_offset=0.3),
+        ppo=dataclasses.replace(_VARIED, timesteps=5_000_000, entropy=(0.04, 0.0), start_offset=0.3),
         evaluation=_JUDGED_OFTEN,
     ),
     "Park": TaskConfig(
