@@ -265,7 +265,7 @@ CONFIGS: dict[str, TaskConfig] = {
             "sinusoid": _gait(limited_by="commanded_speed - forward*speed"),
             "steered sinusoid": _gait(steered=True, limited_by="commanded_speed - forward*speed"),
         },
-        ppo=dataclasses.replace(_VARIED, reward_scale=0.05),
+        ppo=dataclasses.replace(_VARIED, timesteps=3_000_000, reward_scale=0.05),
         evaluation=_JUDGED_OFTEN,
     ),
     "Goal": TaskConfig(
