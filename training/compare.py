@@ -25,7 +25,7 @@ import tyro
 from rich.console import Console
 
 from training import config as settings_of
-from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig, check_env_id
+from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig
 from training.evaluate import Controller, Rollout, evaluate, load_policy, make_envs
 from training.metrics import headline, metrics_of
 from training.optimal import reference
@@ -50,6 +50,7 @@ class Compare:
         seeds: numbers of the PPO runs on each; 0-9 is short for ten of them.
         timesteps: environment steps of a PPO run; None for the settings of the task.
         drag: let the mechanisms' drag act.
+        sprint: train for seconds instead of minutes, with what passes the steered gait soonest.
         out: folder of the results. What is finished in it is used again if its settings are the same.
         processes: processes side by side.
         tensorboard: folder of TensorBoard's files; None for none.
@@ -60,6 +61,7 @@ class Compare:
     seeds: Seeds = (0, 1, 2)
     timesteps: int | None = None
     drag: bool = False
+    sprint: bool = False
     out: Path = Path("runs/compare")
     processes: int = os.cpu_count() or 1
     tensorboard: Path | None = None
@@ -67,7 +69,7 @@ class Compare:
 
     def __post_init__(self) -> None:
         for env_id in self.env_ids:
-            check_env_id(env_id)
+            settings_of.for_env(env_id, self.drag, self.sprint)
         check_seeds(self.seeds)
         check_tensorboard(self.tensorboard)
         if self.processes < 1:
@@ -75,7 +77,7 @@ class Compare:
 
     def config(self, env_id: str) -> TaskConfig:
         """Settings for an environment."""
-        config = settings_of.for_env(env_id, self.drag)
+        config = settings_of.for_env(env_id, self.drag, self.sprint)
         if self.quick:
             config = settings_of.quick(config)
         if self.timesteps is not None:

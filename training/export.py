@@ -112,11 +112,21 @@ def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 10
 
 def command(learned: Mapping[str, Any]) -> str:
     """Command that trains a policy, given the settings that its history has."""
-    drag = " --drag" if learned["ppo"]["env_kwargs"].get("drag") else ""
-    timesteps = learned["ppo"]["timesteps"]
+    env_id, ppo = learned["env_id"], learned["ppo"]
+    drag = bool(ppo["env_kwargs"].get("drag"))
+    options = f"{' --drag' if drag else ''}{' --sprint' if _sprinted(env_id, drag, ppo) else ''}"
     return (
-        f"python -m training.train --env-id {learned['env_id']} --seed {learned['seed']} --timesteps {timesteps}{drag}"
+        f"python -m training.train --env-id {env_id} --seed {learned['seed']} --timesteps {ppo['timesteps']}{options}"
     )
+
+
+def _sprinted(env_id: str, drag: bool, ppo: Mapping[str, Any]) -> bool:
+    """Whether these settings, as they are read back, are those of a sprint, however long."""
+    try:
+        sprint = dataclasses.replace(for_env(env_id, drag, sprint=True).ppo, timesteps=ppo["timesteps"])
+    except ValueError:  # there is none
+        return False
+    return bool(json.loads(json.dumps(dataclasses.asdict(sprint))) == ppo)
 
 
 def chosen(folder: Path) -> Iterator[tuple[Path, str]]:

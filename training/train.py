@@ -261,6 +261,7 @@ class Train:
         seed: number of the run.
         timesteps: environment steps; None for the settings of the task.
         drag: let the mechanism's drag act.
+        sprint: train for seconds instead of minutes, with what passes the steered gait soonest.
         out: folder of the results.
         tensorboard: folder of TensorBoard's files; None for none.
     """
@@ -269,18 +270,19 @@ class Train:
     seed: int = 0
     timesteps: int | None = None
     drag: bool = False
+    sprint: bool = False
     out: Path = Path("runs/train")
     tensorboard: Path | None = None
 
     def __post_init__(self) -> None:
-        check_env_id(self.env_id)
+        for_env(self.env_id, self.drag, self.sprint)
         training_seed(self.seed)
         check_tensorboard(self.tensorboard)
 
 
 def main(options: Train) -> None:
     """Train under a progress bar."""
-    config = for_env(options.env_id, options.drag).ppo
+    config = for_env(options.env_id, options.drag, options.sprint).ppo
     if options.timesteps is not None:
         config = dataclasses.replace(config, timesteps=options.timesteps)
     path = ppo_path(options.env_id, config, options.seed, options.out).with_suffix(".zip")

@@ -188,7 +188,17 @@ def test_drag_is_another_experiment(finished):
     assert options.jobs() == []
 
 
+def test_a_sprint_trains_with_other_settings(monkeypatch):
+    other = dataclasses.replace(TINY.ppo, gamma=0.5)
+    monkeypatch.setitem(config.CONFIGS, "Forward", dataclasses.replace(TINY, sprint_of={"snakeboard, drag": other}))
+    usual = Compare(env_ids=(SNAKEBOARD,), drag=True).config(SNAKEBOARD)
+    sprint = Compare(env_ids=(SNAKEBOARD,), drag=True, sprint=True).config(SNAKEBOARD)
+    assert sprint == dataclasses.replace(usual, ppo=dataclasses.replace(usual.ppo, gamma=0.5))
+
+
 def test_options_are_checked():
+    with pytest.raises(ValueError, match="leave --sprint out"):
+        Compare(sprint=True)
     with pytest.raises(ValueError, match="Did you mean 'nhenv/SnakeboardForward-v0'"):
         Compare(env_ids=("nhenv/SnakeBoardForward-v0",))
     with pytest.raises(ValueError, match="different numbers"):

@@ -143,9 +143,20 @@ def test_a_mechanism_has_settings_of_its_own_with_drag_and_without():
     assert for_env("nhenv/CarForward-v0").ppo == forward.ppo
 
 
+def test_a_sprint_is_shorter_where_there_is_one():
+    for env_id in COMPARED:
+        sprint, usual = (for_env(env_id, drag=True, sprint=sprint) for sprint in (True, False))
+        assert sprint.ppo.timesteps <= usual.ppo.timesteps / 2
+        assert sprint.ppo.env_kwargs == {"drag": True}
+        assert sprint == dataclasses.replace(usual, ppo=sprint.ppo)
+    for env_id, drag in ((SNAKEBOARD, False), ("nhenv/CarForward-v0", True), ("nhenv/SnakeboardGoal-v0", True)):
+        with pytest.raises(ValueError, match=f"no settings for a sprint on {env_id} with.* leave --sprint out"):
+            for_env(env_id, drag=drag, sprint=True)
+
+
 def test_settings_of_their_own_are_of_mechanisms_that_there_are():
     known = {f"{name}{drag}" for name in mechanics.names() for drag in ("", ", drag")}
-    assert all(set(config.ppo_of) <= known for config in CONFIGS.values())
+    assert all({*config.ppo_of, *config.sprint_of} <= known for config in CONFIGS.values())
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path, monkeypatch):

@@ -1,3 +1,4 @@
+import dataclasses
 import hashlib
 import io
 import json
@@ -18,7 +19,7 @@ from stable_baselines3 import PPO
 
 import nhenv
 from training import policies
-from training.config import CONFIGS, EVALUATION_SEEDS, EvaluationConfig, PPOConfig, TaskConfig
+from training.config import CONFIGS, EVALUATION_SEEDS, EvaluationConfig, PPOConfig, TaskConfig, for_env
 from training.evaluate import Evaluate, PolicyController, load_policy, make_envs, origin, recorded, rollout
 from training.export import actor, chosen, command, export
 from training.policies import Policy, PolicyError, load, pack, read
@@ -99,6 +100,9 @@ def test_card_tells_what_the_file_does_and_how_it_came_about(trained, exported):
     assert card["training"]["command"] == f"python -m training.train --env-id {SNAKEBOARD} --seed 1 --timesteps 512"
     dragged = {"env_id": SNAKEBOARD, "seed": 2, "ppo": {"timesteps": 9, "env_kwargs": {"drag": True}}}
     assert command(dragged) == f"python -m training.train --env-id {SNAKEBOARD} --seed 2 --timesteps 9 --drag"
+    sprint = dataclasses.replace(for_env(SNAKEBOARD, drag=True, sprint=True).ppo, timesteps=9)
+    sprinted = json.loads(json.dumps(dragged | {"ppo": dataclasses.asdict(sprint)}))
+    assert command(sprinted) == f"python -m training.train --env-id {SNAKEBOARD} --seed 2 --timesteps 9 --drag --sprint"
     envs = recorded(SNAKEBOARD, 4, torque_limits=0.3)
     episodes = rollout(policy, envs, range(EVALUATION_SEEDS, EVALUATION_SEEDS + 4))
     assert card["evaluation"]["metrics"]["return"]["mean"] == pytest.approx(episodes.returns.mean(), rel=1e-12)

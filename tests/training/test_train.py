@@ -123,6 +123,11 @@ def test_missing_tensorboard_is_named_with_its_extra(tmp_path, monkeypatch):
     assert Train(env_id=SNAKEBOARD).tensorboard is None
 
 
+def test_a_sprint_is_refused_where_there_is_none():
+    with pytest.raises(ValueError, match="leave --sprint out"):
+        Train(env_id=SNAKEBOARD, sprint=True)
+
+
 def test_settings_reach_the_algorithm():
     # None of these is a default of Stable-Baselines3.
     config = PPOConfig(
