@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
@@ -91,6 +92,7 @@ def _show(progress: Progress, bars: Sequence[Any], messages: Any) -> None:
 
 
 _channel: tuple[Any, Any] | None = None  # (messages, stop) of this worker process, set once by _begin
+_working = threading.Lock()  # while this worker process is at a job
 
 
 def _begin(messages: Any, stop: Any) -> None:
@@ -98,6 +100,15 @@ def _begin(messages: Any, stop: Any) -> None:
     # Ctrl-C reaches every process of the terminal; the first one passes it on in good order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _channel = messages, stop
+    threading.Thread(target=_follow, args=(multiprocessing.parent_process(), stop), daemon=True).start()
+
+
+def _follow(parent: Any, stop: Any) -> None:
+    """End with the process that gave the jobs, however it ended: nobody else would tell this one to."""
+    parent.join()
+    stop.set()
+    with _working:  # once what is at work has been saved
+        os._exit(1)
 
 
 def _work(number: int, job: Job) -> None:
@@ -111,4 +122,5 @@ def _work(number: int, job: Job) -> None:
         if stop.is_set():
             raise Interrupted
 
-    job.function(*job.arguments, report=report)
+    with _working:
+        job.function(*job.arguments, report=report)
