@@ -260,17 +260,8 @@ CONFIGS: dict[str, TaskConfig] = {
             "roller_racer": PPOConfig(timesteps=1_500_000, reward_scale=0.02, entropy=(0.02, 0.0), start_energy=20.0),
             "roller_racer, drag": PPOConfig(reward_scale=0.05, entropy=(0.06, 0.0), start_energy=8.0),
         },
-        # Of a random search on tuning seeds: small networks and large steps; for the racer a short horizon too.
+        # Of a random search on tuning seeds. What it found for the snakeboard passed in 20 s or never.
         sprint_of={
-            "snakeboard, drag": PPOConfig(
-                timesteps=1_500_000,
-                learning_rate=(5e-3, 3e-4),
-                reward_scale=0.05,
-                entropy=(0.02, 0.0),
-                start_energy=30.0,
-                hidden=(64,),
-                curve_every=5,
-            ),
             "roller_racer, drag": PPOConfig(
                 timesteps=140_000,
                 n_epochs=6,
