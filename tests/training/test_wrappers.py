@@ -13,7 +13,7 @@ ENERGY, ROWS = 40.0, 400
 
 
 def _made(env_id, rows=ROWS, steps=10**9, offset=0.0, **arguments):
-    envs = make_sb3_vec_env(env_id, rows, staggered=False, whole_state=True, **arguments)
+    envs = make_sb3_vec_env(env_id, rows, staggered=False, seed=0, whole_state=True, **arguments)
     return MovingStarts(envs, ENERGY, offset, steps, seed=3)
 
 
