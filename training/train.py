@@ -240,7 +240,8 @@ def _logger(folder: Path | None) -> Logger:
 
 def ppo_settings(env_id: str, config: PPOConfig, seed: int) -> dict[str, Any]:
     """All that a trained policy follows from."""
-    return settings(env_id, _CODE, ppo=config, seed=seed)
+    seeds = {"training": training_seed(seed), "curve": TUNING_SEEDS}
+    return settings(env_id, _CODE, ppo=config, seed=seed, seeds=seeds)
 
 
 def ppo_path(env_id: str, config: PPOConfig, seed: int, out: Path) -> Path:

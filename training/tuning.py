@@ -122,7 +122,7 @@ def tune_piece(env_id: str, config: SearchConfig, out: Path, report: Report = ig
 
 def gait_settings(env_id: str, config: SearchConfig) -> dict[str, Any]:
     """All that a tuned controller follows from."""
-    return settings(env_id, _CODE, gait=config, kind=type(config).__name__)
+    return settings(env_id, _CODE, gait=config, kind=type(config).__name__, seeds=TUNING_SEEDS)
 
 
 def search_config(data: Mapping[str, Any]) -> SearchConfig:

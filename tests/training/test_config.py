@@ -7,7 +7,8 @@ import pytest
 import mechanics
 import nhenv
 from nhenv import tasks
-from training import evaluate, metrics, time_aware, train, wrappers
+from training import config as config_module
+from training import evaluate, metrics, time_aware, train, tuning, wrappers
 from training.config import (
     COMPARED,
     CONFIGS,
@@ -85,6 +86,20 @@ def test_path_depends_on_seed_environment_and_code(tmp_path):
     assert len(paths) == 3
     assert digest(settings(SNAKEBOARD, "a")) != digest(settings(SNAKEBOARD, "b"))
     assert piece_path(tmp_path, settings(SNAKEBOARD, "a"), "x").parent == tmp_path / "SnakeboardForward-v0"
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [(config_module, "SEEDS_PER_RUN"), (train, "TUNING_SEEDS"), (tuning, "TUNING_SEEDS")],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
+def test_paths_depend_on_where_the_seeds_of_environments_begin(tmp_path, monkeypatch, module, name):
+    def paths():
+        return {ppo_path(SNAKEBOARD, PPOConfig(), 1, tmp_path), gait_path(SNAKEBOARD, GaitConfig(), tmp_path)}
+
+    before = paths()
+    monkeypatch.setattr(module, name, getattr(module, name) + 1)
+    assert len(before | paths()) == 3
 
 
 def test_code_of_a_result_is_that_of_all_modules_from_which_it_follows():
