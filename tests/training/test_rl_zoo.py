@@ -43,6 +43,7 @@ def test_an_entry_makes_the_same_model(env_id):
     nets, own = theirs.policy.mlp_extractor, ours.policy.mlp_extractor
     assert str(nets.policy_net) == str(own.policy_net)
     assert str(nets.value_net[1:]) == str(own.value_net[1:])  # whose first layer sees the time here
+    assert theirs.policy.optimizer.defaults == ours.policy.optimizer.defaults
     assert theirs.policy.log_std.tolist() == ours.policy.log_std.tolist()
     for name in ("n_envs", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "target_kl", "ent_coef"):
         assert getattr(theirs, name) == getattr(ours, name), name
@@ -56,4 +57,5 @@ def test_settings_reach_the_entry():
     assert (written["n_envs"], written["gamma"], written["learning_rate"]) == (3, 0.5, "lin_0.5")
     assert eval(written["policy_kwargs"], {"nn": nn, "dict": dict}) == {
         "net_arch": {"pi": [7, 5], "vf": [7, 5]}, "activation_fn": nn.Tanh, "log_std_init": -2.0,
+        "optimizer_kwargs": {"eps": 1e-5, "fused": True},
     }  # fmt: skip
