@@ -273,6 +273,7 @@ def few(monkeypatch):
     monkeypatch.setattr(default_errors, "EPISODE", 40)
 
 
+@pytest.mark.slow
 def test_errors_of_holds_are_those_of_the_integrator(few):
     found = {one.policy: one for one in hold_errors("roller_racer", True, {}, rows=16, every=10)}
     for one in found.values():
