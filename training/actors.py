@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from nhenv.vector_env import LocomotionVectorEnv
 from training import policies
-from training.evaluate import Controller, load_policy
+from training.evaluate import load_policy
+from training.rollout import Controller
 from training.store import read_json
 from training.tuning import controller, search_config
 

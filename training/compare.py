@@ -26,13 +26,14 @@ from rich.console import Console
 
 from training import config as settings_of
 from training.config import EVALUATION_SEEDS, SEEDS_PER_RUN, TUNING_SEEDS, TaskConfig
-from training.evaluate import Controller, Rollout, evaluate, load_policy, make_envs
+from training.evaluate import evaluate, load_policy
 from training.metrics import headline, metrics_of
 from training.optimal import reference
 from training.options import Seeds, check_seeds
 from training.plots import GAITS, POLICY, Shown, draw
 from training.progress import Job, run_jobs
 from training.report import markdown, tables
+from training.rollout import Controller, Rollout, make_envs
 from training.statistics import median_run, seconds_to_pass, summary
 from training.store import machine, read_json, versions, write_bytes, write_json
 from training.train import check_tensorboard, ppo_path, train_piece

@@ -23,9 +23,10 @@ from torch import nn
 
 from training import policies
 from training.config import EVALUATION_SEEDS, check_env_id, for_env
-from training.evaluate import PolicyController, evaluate, load_policy, make_envs
+from training.evaluate import evaluate, load_policy
 from training.metrics import METRICS, headline, metric_of, metrics_of
 from training.report import cell, markdown_table
+from training.rollout import PolicyController, make_envs
 from training.statistics import median_run, summary
 from training.store import read_json, settings, versions, write_bytes, write_json
 

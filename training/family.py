@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds
 
-from training.evaluate import Controller
+from training.rollout import Controller
 
 __all__ = ["Family"]
 

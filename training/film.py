@@ -30,7 +30,7 @@ from nhenv.canvas import Canvas
 from nhenv.vector_env import LocomotionVectorEnv
 from training.actors import Actor, actors_of, random_actor
 from training.config import EVALUATION_SEEDS
-from training.evaluate import rollout
+from training.rollout import rollout
 from training.store import write_bytes
 
 __all__ = ["Film", "Take", "film", "frames", "gif", "mp4", "record"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,7 @@ from mechanics.mechanism import Mechanism
 from mechanics.model import Model
 from nhenv.tasks import Task
 from nhenv.vector_env import LocomotionVectorEnv
-
-if TYPE_CHECKING:
-    from training.evaluate import Rollout
+from training.rollout import Rollout
 
 __all__ = ["METRICS", "Metric", "headline", "joint_index", "measure", "metric_of", "metrics_of"]
 
@@ -104,7 +101,7 @@ def _success(envs: LocomotionVectorEnv, episodes: Rollout) -> Array:
     """1 where the last step of an episode was a success, else 0."""
     if "is_success" not in episodes.final:
         raise ValueError(
-            "success was not recorded: make the environments with info='final', as training.evaluate.recorded does"
+            "success was not recorded: make the environments with info='final', as training.rollout.recorded does"
         )
     return (episodes.final["is_success"] > 0).astype(float)
 

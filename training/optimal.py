@@ -36,9 +36,9 @@ from scipy.optimize import Bounds
 from training.actors import Actor, actor
 from training.climbing import TRIALS, climb
 from training.config import COMPARED, check_env_id
-from training.evaluate import make_envs
 from training.evolution import evolve
 from training.progress import Job, Report, ignore, run_jobs
+from training.rollout import make_envs
 from training.shooting import Shooting
 from training.store import read_json, versions, write_json
 

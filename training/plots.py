@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nhenv.vector_env import LocomotionVectorEnv
-from training.evaluate import Rollout
 from training.metrics import headline, joint_index
+from training.rollout import Rollout
 from training.store import write_bytes
 
 __all__ = ["GAITS", "POLICY", "Shown", "draw", "mathtext", "median_and_range"]

@@ -42,7 +42,7 @@ class PolicyError(ValueError):
 
 
 class Policy:
-    """The mean action of a tanh network: a function, and a controller of `training.evaluate`.
+    """The mean action of a tanh network: a function, and a controller of `training.rollout`.
 
     Args:
         card: what `training.export` wrote beside the weights; "network" and "observation" are used here.

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.model import Model
 from nhenv.vector_env import LocomotionVectorEnv
-from training.evaluate import make_envs
+from training.rollout import make_envs
 
 __all__ = ["Linear", "Shooting"]
 

@@ -31,11 +31,12 @@ from rich.table import Table
 from scipy.stats import qmc
 
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env
-from training.evaluate import evaluate, load_policy, make_envs
+from training.evaluate import evaluate, load_policy
 from training.metrics import headline
 from training.options import Seeds, check_seeds
 from training.progress import Job, run_jobs
 from training.report import cell, markdown_table
+from training.rollout import make_envs
 from training.statistics import summary
 from training.store import machine, read_json, versions, write_bytes, write_json
 from training.train import ppo_path, train_piece

@@ -33,9 +33,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from nhenv.sb3 import make_sb3_vec_env
 from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
-from training.evaluate import PolicyController, recorded, rollout
 from training.metrics import headline, measure
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
+from training.rollout import PolicyController, recorded, rollout
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
 from training.time_aware import TimeAwareCritic
 from training.wrappers import Clock, MovingStarts, ScaledReward
@@ -43,7 +43,7 @@ from training.wrappers import Clock, MovingStarts, ScaledReward
 __all__ = ["arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
 # Whatever a trained policy follows from here: what it learns in, and by what the best of the curve is chosen.
-_MODULES = ("train", "wrappers", "time_aware", "evaluate", "metrics")
+_MODULES = ("train", "wrappers", "time_aware", "rollout", "metrics")
 _CODE = source_digest(*(Path(__file__).with_name(f"{name}.py") for name in _MODULES))
 
 

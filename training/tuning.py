@@ -17,12 +17,12 @@ from mechanics.expressions import unknown_name
 from nhenv.env import LocomotionEnv
 from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, GaitConfig, LawConfig, SearchConfig, TorqueConfig
-from training.evaluate import Controller, make_envs, rollout
 from training.evolution import evolve
 from training.family import Family
 from training.gaits import sinusoids, torque_sinusoids
 from training.laws import law_family
 from training.progress import Report, ignore
+from training.rollout import Controller, make_envs, rollout
 from training.store import piece_path, settings, source_digest, versions, write_json
 
 __all__ = ["FAMILIES", "Tuned", "controller", "family", "gait_path", "search_config", "tune", "tune_piece"]
@@ -39,7 +39,7 @@ FAMILIES: dict[type[SearchConfig], Callable[[Env, Any, float], Family]] = {
 
 # Whatever a tuned vector follows from here; a change of one law makes all results old, which is on the safe side.
 _HERE = Path(__file__).parent
-_MODULES = ("tuning", "evolution", "family", "gaits", "observed", "evaluate", "metrics")
+_MODULES = ("tuning", "evolution", "family", "gaits", "observed", "rollout", "metrics")
 _CODE = source_digest(*(_HERE / f"{name}.py" for name in _MODULES), *sorted(_HERE.joinpath("laws").glob("*.py")))
 
 

@@ -18,12 +18,13 @@ import training.evaluate
 from training import config
 from training.compare import Compare, compare, judge, strongest_known
 from training.config import EVALUATION_SEEDS, EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
-from training.evaluate import Rollout, load_policy, make_envs, recorded, rollout
+from training.evaluate import load_policy
 from training.metrics import measure
 from training.optimal import reference
 from training.plots import GAITS, POLICY, Shown, draw, median_and_range
 from training.progress import Job, run_jobs
 from training.report import markdown
+from training.rollout import Rollout, make_envs, recorded, rollout
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"
 TINY = TaskConfig(

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from training.config import COMPARED
-from training.evaluate import Evaluate, make_envs, rollout
+from training.evaluate import Evaluate
 from training.metrics import joint_index, measure
+from training.rollout import make_envs, rollout
 from training.store import write_json
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"

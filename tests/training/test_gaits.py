@@ -5,9 +5,9 @@ import pytest
 from mechanics.expressions import ExpressionError
 from mechanics.model import Model
 from training.config import COMPARED, GaitConfig, TorqueConfig
-from training.evaluate import make_envs, rollout
 from training.gaits import Feedback, Gait, Joints, Sinusoid
 from training.metrics import measure
+from training.rollout import make_envs, rollout
 from training.tuning import controller, family
 
 SNAKEBOARD = "nhenv/SnakeboardForward-v0"

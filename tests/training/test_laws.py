@@ -4,10 +4,10 @@ from scipy.optimize import linprog
 
 from mechanics.model import Model
 from training.config import LawConfig
-from training.evaluate import make_envs, rollout
 from training.laws import LAWS
 from training.laws.snakeboard import acceleration_to_rest, momentum
 from training.observed import Observed
+from training.rollout import make_envs, rollout
 from training.tuning import controller, family
 
 IDS = {"snakeboard": "nhenv/SnakeboardForward-v0", "roller_racer": "nhenv/RollerRacerForward-v0"}

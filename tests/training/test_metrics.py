@@ -6,8 +6,8 @@ import pytest
 
 from mechanics.mechanism import Mechanism
 from nhenv import tasks
-from training.evaluate import rollout
 from training.metrics import METRICS, headline, joint_index, measure, metric_of, metrics_of
+from training.rollout import rollout
 from training.statistics import STATISTICS
 
 SNAKEBOARD = "nhenv/SnakeboardVelocity-v0"

@@ -12,9 +12,9 @@ import pytest
 from training import optimal
 from training.actors import actor
 from training.config import COMPARED
-from training.evaluate import make_envs
 from training.optimal import FOLDER, Optimal, Reference, driven, improve, load, path_of, reference, replay, search
 from training.policies import SHIPPED, SUFFIX
+from training.rollout import make_envs
 
 CELLS = [(env_id, drag) for env_id in COMPARED for drag in (False, True)]
 SNAKEBOARD, RACER = COMPARED

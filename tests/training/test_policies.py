@@ -20,9 +20,10 @@ from stable_baselines3 import PPO
 import nhenv
 from training import policies
 from training.config import CONFIGS, EVALUATION_SEEDS, EvaluationConfig, PPOConfig, TaskConfig, for_env
-from training.evaluate import Evaluate, PolicyController, load_policy, make_envs, origin, recorded, rollout
+from training.evaluate import Evaluate, load_policy, origin
 from training.export import actor, chosen, command, export
 from training.policies import Policy, PolicyError, load, pack, read
+from training.rollout import PolicyController, make_envs, recorded, rollout
 from training.store import read_json, write_json
 from training.train import make_model, ppo_path, train_piece
 

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from mechanics.geometry.local_connection import height_functions
 from training import shapes as figures
-from training.evaluate import make_envs
 from training.film import Take
+from training.rollout import make_envs
 from training.shapes import PARTS, Shapes, draw, loops, shapes
 
 DT = 0.05

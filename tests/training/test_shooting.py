@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from training.config import COMPARED
-from training.evaluate import make_envs
+from training.rollout import make_envs
 from training.shooting import Shooting
 
 every_environment = pytest.mark.parametrize("env_id", COMPARED)

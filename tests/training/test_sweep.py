@@ -9,8 +9,9 @@ from rich.console import Console
 from training import config
 from training import sweep as module
 from training.config import TUNING_SEEDS, EvaluationConfig, PPOConfig, TaskConfig
-from training.evaluate import load_policy, recorded, rollout
+from training.evaluate import load_policy
 from training.options import seeds
+from training.rollout import recorded, rollout
 from training.sweep import Range, Sweep, combinations, main, parsed, sweep
 from training.train import ppo_path
 

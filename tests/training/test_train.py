@@ -9,8 +9,9 @@ from gymnasium.error import DependencyNotInstalled
 
 from mechanics.compiler import kernels
 from training.config import TUNING_SEEDS, PPOConfig
-from training.evaluate import load_policy, make_envs, rollout
+from training.evaluate import load_policy
 from training.progress import Interrupted, ignore
+from training.rollout import make_envs, rollout
 from training.store import read_json
 from training.train import Linear, Run, Train, make_model, ppo_path, train_piece
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from training.config import COMPARED, CONFIGS, EvaluationConfig, GaitConfig, LawConfig, TorqueConfig, for_env
-from training.evaluate import evaluate, make_envs
+from training.evaluate import evaluate
 from training.laws import LAWS
+from training.rollout import make_envs
 from training.store import read_json
 from training.tuning import FAMILIES, controller, family, gait_path, gait_settings, search_config, tune, tune_piece
 
