@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import nhenv  # noqa: F401 (registers the environments)
 from benchmarks.motions import Problem
 
-__all__ = ["BATCHED", "OURS", "PEER", "SINGLE", "Contender", "Solver", "States", "ours", "pair"]
+__all__ = ["BATCHED", "OURS", "PEER", "SINGLE", "Contender", "Point", "Solver", "States", "ours", "pair"]
 
 Array = NDArray[np.float64]
 States = tuple[Array, Array]  # coordinates and velocities (T + 1, B, n)
@@ -81,6 +81,33 @@ OURS: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
 
 COMMON: dict[str, Any] = {"joint_limits": False, "whole_state": True}
 SHORTEST = 0.02  # s, of a turn
+
+
+@dataclass(frozen=True)
+class Point:
+    """What is known of a contender on a mechanism.
+
+    Attributes:
+        mechanism: its name.
+        contender: who.
+        errors: kind of torque -> largest error.
+        times: seconds for a simulated second of one environment, in each turn.
+    """
+
+    mechanism: str
+    contender: Contender
+    errors: dict[str, float]
+    times: list[float] = field(default_factory=list)
+
+    @property
+    def error(self) -> float:
+        """Largest of all."""
+        return max(self.errors.values())
+
+    @property
+    def time(self) -> float:
+        """Median."""
+        return float(np.median(self.times))
 
 
 def single(options: Mapping[str, Any]) -> Callable[[Problem], Solver]:

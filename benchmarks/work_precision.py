@@ -25,7 +25,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +42,9 @@ from benchmarks.default_errors import HoldErrors, RunErrors, hold_errors, run_er
 from benchmarks.motions import MECHANISMS, Problem, problem
 from benchmarks.reference import Reference
 from benchmarks.solver_peers import PEERS, peers
-from benchmarks.solvers import BATCHED, PEER, SINGLE, Contender, Solver, ours
+from benchmarks.solvers import BATCHED, PEER, SINGLE, Contender, Point, Solver, ours
 
-__all__ = ["Arguments", "Point", "least", "main"]
+__all__ = ["Arguments", "least", "main"]
 
 WIDTH = 150
 PARTS = ("curves", "holds", "runs")
@@ -80,33 +80,6 @@ class Arguments:
     """a minute: two conditions, 1 s, few peers' turns, few holds"""
     out: Path = Path("runs/work_precision")
     """folder for tables, CSV files and the figure"""
-
-
-@dataclass(frozen=True)
-class Point:
-    """What is known of a contender on a mechanism.
-
-    Attributes:
-        mechanism: its name.
-        contender: who.
-        errors: kind of torque -> largest error.
-        times: seconds for a simulated second of one environment, in each turn.
-    """
-
-    mechanism: str
-    contender: Contender
-    errors: dict[str, float]
-    times: list[float] = field(default_factory=list)
-
-    @property
-    def error(self) -> float:
-        """Largest of all."""
-        return max(self.errors.values())
-
-    @property
-    def time(self) -> float:
-        """Median."""
-        return float(np.median(self.times))
 
 
 @dataclass

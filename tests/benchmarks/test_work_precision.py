@@ -16,9 +16,9 @@ from benchmarks.equations import Equations, multipliers
 from benchmarks.motions import MECHANISMS, POLICIES, problem
 from benchmarks.reference import Reference
 from benchmarks.solver_peers import PEERS, peers
-from benchmarks.solvers import BATCHED, PEER, SINGLE, Contender, ours
+from benchmarks.solvers import BATCHED, PEER, SINGLE, Contender, Point, ours
 from benchmarks.textbook import REGULAR
-from benchmarks.work_precision import Arguments, Point, Sheet, curve_sheets, curves, least, main, truth
+from benchmarks.work_precision import Arguments, Sheet, curve_sheets, curves, least, main, truth
 from mechanics.model import Model
 
 DATA = Path(__file__).parents[1] / "data" / "reference"
