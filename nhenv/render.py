@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mechanics.bodies import Placed, place
 from mechanics.expressions import evaluate
 from mechanics.mechanism import Mechanism
+from mechanics.placing import Placed, place
 from nhenv.canvas import Canvas, Colour, Window, pygame_module
 from nhenv.tasks import Task
 

@@ -10,9 +10,10 @@ import zoo
 
 import mechanics
 from mechanics import Body, Mechanism, MechanismError, Model
-from mechanics.bodies import COLOURS, SHAPES, default_bodies, place
+from mechanics.bodies import COLOURS, SHAPES
 from mechanics.catalog.snake import n_link_snake
 from mechanics.catalog.trailer import n_trailer
+from mechanics.placing import default_bodies, place
 
 MECHANISMS = {
     **{name: mechanics.get(name) for name in mechanics.names(in_the_plane=True)},

@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 import mechanics
 import nhenv
 from mechanics import Mechanism
-from mechanics.bodies import place
+from mechanics.placing import place
 from nhenv import canvas
 from nhenv.canvas import Canvas
 from nhenv.render import COLOURS, GROUND, TRAIL_PARTS, View, marker_of
