@@ -16,9 +16,9 @@ from mechanics.compiler.integrators import method
 from mechanics.expressions import unknown_name
 from mechanics.model import Model
 from nhenv import checks, tasks
+from nhenv.compiled import CompiledScene
 from nhenv.registration import MechanismLike, TaskLike, as_mechanism, in_the_plane, unfit
 from nhenv.render import Screen, View, marker_of
-from nhenv.scene import Scene
 
 __all__ = ["MODES", "Configuration", "passes_arguments_on"]
 
@@ -91,7 +91,7 @@ class Configuration:
         self.reset_noise_scale = self._noise(reset_noise_scale)
         self.weights = self._weights(weights)
         self.render_mode, self.render_size = render_mode, _size(render_size)
-        self.scene = Scene(
+        self.scene = CompiledScene(
             self.mechanism,
             self.task,
             frame=frame,

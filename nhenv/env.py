@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.expressions import unknown_name
 from mechanics.model import Model
+from nhenv.compiled import CompiledScene
 from nhenv.configuration import MODES, Configuration, passes_arguments_on
 from nhenv.registration import MechanismLike, TaskLike
 from nhenv.render import Screen
 from nhenv.replay import Replay
-from nhenv.scene import BAD_ACTION, HISTORY_FULL, RUNNING, TERMINATED, Scene
+from nhenv.scene import BAD_ACTION, HISTORY_FULL, RUNNING, TERMINATED
 
 __all__ = ["LocomotionEnv"]
 
@@ -346,7 +347,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.__dict__.update(state)
         self._bind()
 
-    def _new_memory(self, scene: Scene) -> Array:
+    def _new_memory(self, scene: CompiledScene) -> Array:
         numbers = self._configuration.numbers(self.params, self.drag)
         return scene.new_memory(numbers, self.torque_limits, self.joint_limits.values())
 

@@ -1,6 +1,6 @@
 """From a scene to expressions, and from these to the functions that its kernels share.
 
-The symbolic half of `nhenv.scene`: imported only when the cache has no kernel for a scene, so it may import what it
+The symbolic half of `nhenv.compiled`: imported only when the cache has no kernel for a scene, so it may import what it
 likes. `nhenv.one_kernel` and `nhenv.rows_kernel` put these functions around one environment and around many.
 """
 

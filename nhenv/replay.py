@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nhenv.scene import Scene
+from nhenv.compiled import CompiledScene
 
 __all__ = ["Replay"]
 
@@ -21,7 +21,7 @@ class Replay:
         memory: memory of `scene.whole` in the state in which the episode began.
     """
 
-    def __init__(self, scene: Scene, memory: NDArray[np.float64]) -> None:
+    def __init__(self, scene: CompiledScene, memory: NDArray[np.float64]) -> None:
         self._scene, self._memory = scene, memory
         self._done = 0
 

@@ -1,29 +1,11 @@
-"""`Scene`: a mechanism, a task and options, compiled to the one kernel that environments run.
-
-The kernel works on a flat float64 memory, whose parts its table MEMORY names:
-
-    step(memory, observation, *action) -> (status, reward, *reward terms, *info)
-
-It clips the action, integrates one hold through every impact on a stop, and judges the outcome.
-States that nothing observed, rewarded or reported depends on are not in it. What is drawn for an
-episode, the task's targets, has a place in the memory too.
-"""
+"""`Scene`: a mechanism, a task and options; `nhenv.compiled` makes kernels of it."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from types import ModuleType
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mechanics.compiler import kernels
 from mechanics.compiler.integrators import method_names
 from mechanics.expressions import unknown_name
 from mechanics.mechanism import Mechanism
@@ -37,13 +19,6 @@ RUNNING, BAD_ACTION, DIVERGED, HISTORY_FULL, TERMINATED = 0.0, 1.0, 2.0, 3.0, 4.
 LARGEST = 2.0**40
 
 BACKENDS = ("numba", "numpy")  # those of `mechanics.compiler.codegen`, which loads SymPy
-
-
-# Source files of this package that a kernel follows from.
-_DERIVING = (
-    *("scene", "generate", "one_kernel", "entry", "response"),
-    *("rows_kernel", "rows", "random_streams", "observation"),
-)
 
 
 @dataclass(frozen=True)
@@ -93,11 +68,6 @@ class Scene:
         drag = self.mechanism.drag if self.drag else ()
         return (*self.mechanism.parameters, *weights, "dt", "forward", *drag)
 
-    @property
-    def targets(self) -> tuple[str, ...]:
-        """Names of the task's targets that the kernel uses, in the order of their places."""
-        return self.kernel.TARGETS
-
     @cached_property
     def noisy(self) -> tuple[str, ...]:
         """Coordinates that are random at reset: the joints with stops, or else the heading."""
@@ -131,82 +101,6 @@ class Scene:
         return tuple(self.mechanism.joint_limits) if self.stops else ()
 
     @cached_property
-    def kernel(self) -> ModuleType:
-        """The compiled module for one environment, from the cache if possible."""
-        return self._load("one")
-
-    @cached_property
-    def rows_kernel(self) -> ModuleType:
-        """The compiled module for many environments side by side that have the same parameters."""
-        return self._load("rows")
-
-    @cached_property
-    def varied_kernel(self) -> ModuleType:
-        """The compiled module for many environments side by side, each with parameters of its own."""
-        return self._load("varied")
-
-    def _load(self, kind: str) -> ModuleType:
-        specification = self.__getstate__()
-        specification["mechanism"] = self.mechanism.to_dict(drawing=False)
-        specification["task"] = self.task.to_dict(drawing=False) if self.task else None
-        specification["kind"] = kind
-        name = f"{self.mechanism.name}_{self.task.name if self.task else 'state'}_{kind}_{self.backend}"
-        deriving = tuple(Path(__file__).with_name(f"{part}.py") for part in _DERIVING)
-        return kernels.load(name, specification, lambda: self.source(kind), deriving=deriving)
-
-    @cached_property
-    def whole(self) -> Scene:
-        """The same motion with nothing left out and nothing judged."""
-        return dataclasses.replace(self, task=None)
-
-    def new_memory(
-        self, numbers: Mapping[str, float], torque_limits: Iterable[float], stops: Iterable[float]
-    ) -> NDArray[np.float64]:
-        """Memory for one environment.
-
-        Args:
-            numbers: a value for each of `parameters`.
-            torque_limits: (m,) largest torques.
-            stops: (joints,) largest angles.
-        """
-        memory, places = np.zeros(self.kernel.SIZE), self.kernel.MEMORY
-        memory[slice(*places["k"])] = self.kernel.constants([numbers[name] for name in self.parameters])
-        memory[slice(*places["dt"])] = numbers["dt"]
-        memory[slice(*places["limit"])] = list(torque_limits)
-        memory[slice(*places["stop"])] = list(stops)
-        return memory
-
-    def put(self, memory: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        """Write a state, q (n,) and v (k,), into a memory."""
-        values = dict(zip(self.states, (*q, *v), strict=True))
-        memory[slice(*self.kernel.MEMORY["state"])] = [values[name] for name in self.kernel.STATES]
-
-    def aim(self, memory: NDArray[np.float64], targets: Mapping[str, float]) -> None:
-        """Write the targets of an episode, as `Task.draw` returns them, into a memory."""
-        if self.targets:
-            memory[slice(*self.kernel.MEMORY["target"])] = [targets[name] for name in self.targets]
-
-    def values(self, memory: NDArray[np.float64]) -> dict[str, float]:
-        """Value of each state that this scene follows, by name."""
-        return dict(zip(self.kernel.STATES, memory[slice(*self.kernel.MEMORY["state"])].tolist(), strict=True))
-
-    @cached_property
     def states(self) -> tuple[str, ...]:
         """Names of all states of the mechanism: coordinates, then pseudo-velocities."""
         return (*self.mechanism.coordinates, *(f"v{i + 1}" for i in range(self.mechanism.rank)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the kernel, which is loaded again."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-
-    def source(self, kind: str = "one") -> str:
-        """Derive the source of a kernel, "one", "rows" or "varied"; called when the cache has none."""
-        # What does not act leaves no trace: not in symmetries, not in what is observed by default.
-        scene = self if self.drag else dataclasses.replace(self, mechanism=self.mechanism.without_drag())
-        if kind == "one":
-            from nhenv.one_kernel import OneKernel
-
-            return OneKernel(scene).module()
-        from nhenv.rows_kernel import RowsKernel
-
-        return RowsKernel(scene, varied=kind == "varied").module()

@@ -13,9 +13,9 @@ import mechanics
 import nhenv
 from mechanics.mechanism import Mechanism, MechanismError
 from nhenv import tasks
+from nhenv.compiled import CompiledScene
 from nhenv.env import LocomotionEnv
 from nhenv.registration import as_mechanism
-from nhenv.scene import Scene
 from nhenv.vector_env import LocomotionVectorEnv
 
 COMPILED = ("snakeboard", "roller_racer")
@@ -202,12 +202,12 @@ MECHANISMS = {**{name: mechanics.get(name) for name, _ in SOURCES}, "uneven": Me
 def test_without_drag_the_source_is_that_of_a_mechanism_that_has_none(name, task, kind):
     mechanism, task = MECHANISMS[name], tasks.get(task)
     ideal = dataclasses.replace(mechanism, rayleigh="0", drag={})
-    text = Scene(mechanism, task).source(kind)
-    assert text == Scene(ideal, task).source(kind)
+    text = CompiledScene(mechanism, task).source(kind)
+    assert text == CompiledScene(ideal, task).source(kind)
     assert not _words(text) & mechanism.drag.keys()
-    with_drag = Scene(mechanism, task, drag=True)
+    with_drag = CompiledScene(mechanism, task, drag=True)
     assert mechanism.drag.keys() <= _words(with_drag.source(kind))
-    assert set(with_drag.parameters) - set(Scene(mechanism, task).parameters) == mechanism.drag.keys()
+    assert set(with_drag.parameters) - set(CompiledScene(mechanism, task).parameters) == mechanism.drag.keys()
 
 
 def _words(text):
@@ -232,7 +232,7 @@ def test_off_is_the_default(off, actions, rollout):
 
 def test_default_integrators_with_drag():
     """Friction in the joints makes a core of what was exact in time."""
-    text = Scene(mechanics.get("snakeboard"), tasks.get("Forward"), drag=True).source()
+    text = CompiledScene(mechanics.get("snakeboard"), tasks.get("Forward"), drag=True).source()
     assert "States: core (v3), quadrature (phi), core (v1 v2), quadrature (theta), quadrature (x)." in text
     assert "Integrator: verner9" in text
     assert "Pruned: y psi." in text

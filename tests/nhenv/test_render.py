@@ -20,8 +20,8 @@ from mechanics import Mechanism
 from mechanics.placing import place
 from nhenv import canvas
 from nhenv.canvas import Canvas
+from nhenv.compiled import CompiledScene
 from nhenv.render import COLOURS, GROUND, TRAIL_PARTS, View, marker_of
-from nhenv.scene import Scene
 from nhenv.tasks import Task
 
 ROOT = Path(__file__).parents[2]
@@ -275,9 +275,12 @@ def test_impossible_markers(marker, reason):
 def test_no_kernel_depends_on_the_drawing(monkeypatch):
     """Neither on bodies nor on markers: not the source, and not the key under which it is kept."""
     keys = []
-    monkeypatch.setattr("nhenv.scene.kernels.load", lambda name, given, build, deriving: keys.append((name, given)))
+    monkeypatch.setattr("nhenv.compiled.kernels.load", lambda name, given, build, deriving: keys.append((name, given)))
     racer, goal = mechanics.get("roller_racer"), nhenv.tasks.get("Goal")
-    scenes = [Scene(racer, goal), Scene(dataclasses.replace(racer, bodies={}), dataclasses.replace(goal, marker={}))]
+    scenes = [
+        CompiledScene(racer, goal),
+        CompiledScene(dataclasses.replace(racer, bodies={}), dataclasses.replace(goal, marker={})),
+    ]
     for scene in scenes:
         scene._load("one")
     assert keys[0] == keys[1]

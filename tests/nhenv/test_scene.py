@@ -15,8 +15,9 @@ import nhenv
 from mechanics.compiler import backends
 from mechanics.mechanism import Mechanism
 from nhenv import tasks
+from nhenv.compiled import CompiledScene
 from nhenv.env import LocomotionEnv
-from nhenv.scene import BACKENDS, Scene
+from nhenv.scene import BACKENDS
 
 NAMES = ("snakeboard", "roller_racer")
 OTHERS = [name for name in mechanics.names(in_the_plane=True) if name not in NAMES]
@@ -30,7 +31,7 @@ def source():
     def text(name, **options):
         key = name, *sorted(options.items())
         if key not in known:
-            known[key] = Scene(mechanics.get(name), tasks.get("Forward"), **options).source()
+            known[key] = CompiledScene(mechanics.get(name), tasks.get("Forward"), **options).source()
         return known[key]
 
     return text
@@ -72,7 +73,7 @@ def test_no_stop_no_code_for_stops(source):
 
 
 def test_no_target_and_no_end_no_code_for_them(source):
-    goal = Scene(mechanics.get("snakeboard"), tasks.get("Goal")).source()
+    goal = CompiledScene(mechanics.get("snakeboard"), tasks.get("Goal")).source()
     traces = ("'goal_x'", "'target'", "def ends", "over = ", "_terminated")
     assert all(trace in goal for trace in traces)
     for name in NAMES:
@@ -82,8 +83,8 @@ def test_no_target_and_no_end_no_code_for_them(source):
 def test_sources_do_not_depend_on_hashes(source):
     """The same text in every process, else Numba could not cache and no two machines would agree."""
     script = (
-        "import sys, mechanics\nfrom nhenv import tasks\nfrom nhenv.scene import Scene\n"
-        "sys.stdout.write(Scene(mechanics.get('roller_racer'), tasks.get('Forward')).source())"
+        "import sys, mechanics\nfrom nhenv import tasks\nfrom nhenv.compiled import CompiledScene\n"
+        "sys.stdout.write(CompiledScene(mechanics.get('roller_racer'), tasks.get('Forward')).source())"
     )
     for seed in ("1", "2"):
         env = {**os.environ, "PYTHONHASHSEED": seed}
