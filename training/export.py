@@ -29,23 +29,31 @@ from training.report import cell, markdown_table
 from training.rollout import PolicyController, make_envs
 from training.statistics import median_run, summary
 from training.store import read_json, settings, versions, write_bytes, write_json
+from training.train import MODULES
 
 __all__ = ["actor", "card_text", "chosen", "export"]
 
 
-def actor(controller: PolicyController) -> policies.Layers:
-    """Layers of the network behind the mean action; ValueError if it is not a tanh network and nothing else."""
+def actor(controller: PolicyController) -> tuple[str, policies.Layers]:
+    """Activation and layers of the network behind the mean action.
+
+    Raises:
+        ValueError: it is something else than linear layers with one of the activations between them.
+    """
     policy = controller.model.policy
     net, head = policy.mlp_extractor.policy_net, policy.action_net
-    kinds = [type(module) for module in net.children()]
+    inner, between = [*net.children()][::2], [*net.children()][1::2]
+    linear = [layer for layer in (*inner, head) if isinstance(layer, nn.Linear)]
     plain = type(policy.features_extractor).__name__ == "FlattenExtractor" and not policy.squash_output
-    if not (plain and isinstance(head, nn.Linear) and kinds == [nn.Linear, nn.Tanh] * (len(kinds) // 2)):
+    plain &= len(linear) == len(inner) + 1 == len(between) + 1
+    # A module's text tells its slope, too.
+    fitting = [name for name, module in MODULES.items() if all(repr(one) == repr(module()) for one in between)]
+    if not (plain and fitting):
         raise ValueError(
-            f"only networks of linear layers with tanh between them can be exported, got {policy.features_extractor}, "
-            f"{net}, {head}, squash_output={policy.squash_output}"
+            f"only networks of linear layers with one of {list(MODULES)} between them can be exported, got "
+            f"{policy.features_extractor}, {net}, {head}, squash_output={policy.squash_output}"
         )
-    linear = [module for module in (*net.children(), head) if isinstance(module, nn.Linear)]
-    return [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in linear]
+    return fitting[0], [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in linear]
 
 
 def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 100, why: str = "") -> Path:
@@ -70,7 +78,7 @@ def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 10
             raise ValueError(f"{path} learned with another {part} of {env_id} than there is now: train it again")
     controller = load_policy(path)
     assert isinstance(controller, PolicyController)
-    layers = actor(controller)
+    activation, layers = actor(controller)
     envs, content = make_envs(env_id, 1, **env_kwargs), policies.pack(layers)
     card: dict[str, Any] = {
         "format": policies.FORMAT,
@@ -78,7 +86,7 @@ def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 10
         "env_kwargs": env_kwargs,
         "observation": list(envs.observation_labels),
         "action": list(envs.mechanism.controls),
-        "network": {"activation": "tanh", "layers": [layers[0][0].shape[1], *(len(bias) for _, bias in layers)]},
+        "network": {"activation": activation, "layers": [layers[0][0].shape[1], *(len(bias) for _, bias in layers)]},
         "sha256": hashlib.sha256(content).hexdigest(),
         "chosen": why,
         "training": {
@@ -157,7 +165,7 @@ def card_text(card: Mapping[str, Any], name: str) -> str:
         "",
         f"A policy for `{card['env_id']}`"
         + (f" with `{made_with}`" if made_with else "")
-        + ": a tanh network of sizes "
+        + f": a {card['network']['activation'].replace('_', ' ')} network of sizes "
         f"{card['network']['layers']}, from {', '.join(card['observation'])} to {', '.join(card['action'])} over their "
         "limits. It learned in simulation alone; of a machine it knows nothing.",
         "",

@@ -15,7 +15,7 @@ import hashlib
 import json
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,12 @@ LARGEST_CARD = 1 << 20
 
 _short = reprlib.repr  # an error message need not be as long as what is wrong
 
+# Between the layers, under the names that `training.config.PPOConfig.activation` has for them.
+ACTIVATIONS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "leaky_relu": lambda values: np.maximum(values, 0.01 * values),
+    "tanh": np.tanh,
+}
+
 Layers = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
@@ -42,7 +48,7 @@ class PolicyError(ValueError):
 
 
 class Policy:
-    """The mean action of a tanh network: a function, and a controller of `training.rollout`.
+    """The mean action of a network: a function, and a controller of `training.rollout`.
 
     Args:
         card: what `training.export` wrote beside the weights; "network" and "observation" are used here.
@@ -54,6 +60,7 @@ class Policy:
 
     def __init__(self, card: Mapping[str, Any], layers: Layers) -> None:
         self.card = card
+        self._activation = ACTIVATIONS[card["network"]["activation"]]
         # In float64, so that what is left of a difference to another library is that library's rounding.
         self._layers = [(np.asarray(weight, float).T.copy(), np.asarray(bias, float)) for weight, bias in layers]
 
@@ -68,7 +75,7 @@ class Policy:
             raise ValueError(f"observations must have shape (..., {len(labels)}): {labels}; got {values.shape}")
         *hidden, (weight, bias) = self._layers
         for inner, shift in hidden:
-            values = np.tanh(values @ inner + shift)
+            values = self._activation(values @ inner + shift)
         return np.clip(values @ weight + bias, -1, 1).astype(np.float32)
 
     def require(self, labels: Sequence[str]) -> None:
@@ -162,8 +169,8 @@ def _checked(card: Any) -> list[int]:
             f"the card has the format {_short(card['format'])}, and this version of nhenv reads {FORMAT!r}"
         )
     network = card["network"]
-    if network.get("activation") != "tanh":
-        raise PolicyError(f"the card's activation must be 'tanh', got {_short(network.get('activation'))}")
+    if (activation := network.get("activation")) not in tuple(ACTIVATIONS):  # which need not be hashable
+        raise PolicyError(f"the card's activation must be one of {list(ACTIVATIONS)}, got {_short(activation)}")
     sizes = network.get("layers")
     whole = isinstance(sizes, list) and all(isinstance(size, int) and size > 0 for size in sizes)
     if not whole or len(sizes) < 2 or sizes[0] != len(card["observation"]):

@@ -40,11 +40,14 @@ from training.store import piece_path, settings, source_digest, versions, write_
 from training.time_aware import TimeAwareCritic
 from training.wrappers import Clock, MovingStarts, ScaledReward
 
-__all__ = ["arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
+__all__ = ["MODULES", "arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
 # Whatever a trained policy follows from here: what it learns in, and by what the best of the curve is chosen.
 _MODULES = ("train", "wrappers", "time_aware", "rollout", "metrics")
 _CODE = source_digest(*(Path(__file__).with_name(f"{name}.py") for name in _MODULES))
+
+# By `PPOConfig.activation`.
+MODULES: dict[str, type[torch.nn.Module]] = {"leaky_relu": torch.nn.LeakyReLU, "tanh": torch.nn.Tanh}
 
 
 @dataclass(frozen=True)
@@ -180,7 +183,7 @@ def arguments(config: PPOConfig) -> dict[str, Any]:
         "ent_coef": config.entropy[0],
         "policy_kwargs": {
             "net_arch": {"pi": list(config.hidden), "vf": list(config.hidden)},
-            "activation_fn": torch.nn.Tanh,
+            "activation_fn": MODULES[config.activation],
             "log_std_init": config.log_std,
             "optimizer_kwargs": {"eps": 1e-5, "fused": True},  # Stable-Baselines3's, in one call for all parameters
         },

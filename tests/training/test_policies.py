@@ -8,6 +8,7 @@ import re
 import struct
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -63,12 +64,15 @@ def observations_like(labels, count=2000):
     return np.random.default_rng(0).normal(0, 2, (count, len(labels))).astype(np.float32)
 
 
-def test_it_acts_as_stable_baselines_does(trained, exported):
-    model, policy = load_policy(trained).model, load(exported)
+@pytest.mark.parametrize("activation", policies.ACTIVATIONS)
+def test_it_acts_as_stable_baselines_does(activation, exported):
+    model, policy = make_model(SNAKEBOARD, dataclasses.replace(TINY, activation=activation), 0), load(exported)
     with torch.no_grad():  # as decided as a policy is after a long training, and clipped now and then
         torch.manual_seed(0)
         torch.nn.init.normal_(model.policy.action_net.weight, std=0.5)
-    policy = read(dict(policy.card, sha256=digest_of(model)), pack(actor(PolicyController(model))))
+    told, layers = actor(PolicyController(model))
+    network = policy.card["network"] | {"activation": told}
+    policy = read(dict(policy.card, sha256=digest_of(model), network=network), pack(layers))
     observations = observations_like(policy.card["observation"])
     expected = model.predict(observations, deterministic=True)[0]
     assert 0.02 < (np.abs(expected) == 1).mean() < 0.95
@@ -79,7 +83,7 @@ def test_it_acts_as_stable_baselines_does(trained, exported):
 
 
 def digest_of(model):
-    return hashlib.sha256(pack(actor(PolicyController(model)))).hexdigest()
+    return hashlib.sha256(pack(actor(PolicyController(model))[1])).hexdigest()
 
 
 def test_it_drives_as_the_policy_it_was(trained, exported):
@@ -218,10 +222,15 @@ def test_shipped_policies_fit_their_environments(name):
     assert (policies.SHIPPED / f"{name}.safetensors").stat().st_size < 100_000
 
 
-def test_layers_are_what_the_formula_says():
-    policy = read(card_of(pack(LAYERS)), pack(LAYERS))
-    # Three times tanh((0.2 + 0.4)/2), plus 0.1.
-    assert policy([0.2, 0.4]) == pytest.approx([3 * np.tanh(0.3) + 0.1], rel=1e-6)
+@pytest.mark.parametrize(
+    ("activation", "above", "below"), [("tanh", np.tanh(0.1), np.tanh(-0.1)), ("leaky_relu", 0.1, -0.001)]
+)
+def test_layers_are_what_the_formula_says(activation, above, below):
+    network = {"activation": activation, "layers": [2, 3, 1]}
+    policy = read(card_of(pack(LAYERS), network=network), pack(LAYERS))
+    # Three times the activation of (0.4 - 0.2)/2, plus 0.1.
+    assert policy([0.4, -0.2]) == pytest.approx([3 * above + 0.1], rel=1e-6)
+    assert policy([-0.4, 0.2]) == pytest.approx([3 * below + 0.1], rel=1e-6)
     assert policy([9, 9]) == 1.0
     assert policy(np.zeros((4, 3, 2))).shape == (4, 3, 1)
 
@@ -266,7 +275,10 @@ HOSTILE_CARDS = {
     "reads 'nhenv policy 1'": {"format": "nhenv policy 2"},
     "'sha256' must be a str": {"sha256": 5},
     "'network' must be a dict": {"network": [2, 3, 1]},
-    "must be 'tanh'": {"network": {"activation": "__import__('os')", "layers": [2, 3, 1]}},
+    "must be one of ['leaky_relu', 'tanh'], got \"__import__('os')\"": {
+        "network": {"activation": "__import__('os')", "layers": [2, 3, 1]}
+    },
+    "got ['tanh']": {"network": {"activation": ["tanh"], "layers": [2, 3, 1]}},
     "the sizes of 2 observations": {"network": {"activation": "tanh", "layers": [3, 3, 1]}},
     "got [2]": {"network": {"activation": "tanh", "layers": [2]}},
     "got [2, -3, 1]": {"network": {"activation": "tanh", "layers": [2, -3, 1]}},
@@ -331,13 +343,20 @@ def test_missing_library_is_named_with_its_extra(monkeypatch):
         read(card_of(content), content)
 
 
-@pytest.mark.parametrize("other", [{"activation_fn": torch.nn.ReLU}, {"squash_output": True, "use_sde": True}])
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"activation_fn": torch.nn.SiLU},
+        {"activation_fn": partial(torch.nn.LeakyReLU, 0.2)},
+        {"squash_output": True, "use_sde": True},
+    ],
+)
 def test_other_networks_are_not_exported(other):
     use_sde = other.get("use_sde", False)
     kwargs = {name: value for name, value in other.items() if name != "use_sde"}
     envs = make_model(SNAKEBOARD, TINY, 0).get_env()
     model = PPO("MlpPolicy", envs, policy_kwargs={"activation_fn": torch.nn.Tanh, **kwargs}, use_sde=use_sde)
-    with pytest.raises(ValueError, match="only networks of linear layers with tanh"):
+    with pytest.raises(ValueError, match="only networks of linear layers with one of"):
         actor(PolicyController(model))
 
 

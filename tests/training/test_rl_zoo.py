@@ -52,10 +52,12 @@ def test_an_entry_makes_the_same_model(env_id):
 
 
 def test_settings_reach_the_entry():
-    config = PPOConfig(n_envs=3, learning_rate=(0.5, 0.25), hidden=(7, 5), log_std=-2.0, gamma=0.5)
+    config = PPOConfig(
+        n_envs=3, learning_rate=(0.5, 0.25), hidden=(7, 5), activation="leaky_relu", log_std=-2.0, gamma=0.5
+    )
     written = yaml.safe_load("\n".join(f"{name}: {value}" for name, value in entry(config).items()))
     assert (written["n_envs"], written["gamma"], written["learning_rate"]) == (3, 0.5, "lin_0.5")
     assert eval(written["policy_kwargs"], {"nn": nn, "dict": dict}) == {
-        "net_arch": {"pi": [7, 5], "vf": [7, 5]}, "activation_fn": nn.Tanh, "log_std_init": -2.0,
+        "net_arch": {"pi": [7, 5], "vf": [7, 5]}, "activation_fn": nn.LeakyReLU, "log_std_init": -2.0,
         "optimizer_kwargs": {"eps": 1e-5, "fused": True},
     }  # fmt: skip

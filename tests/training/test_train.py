@@ -133,7 +133,7 @@ def test_settings_reach_the_algorithm():
     # None of these is a default of Stable-Baselines3.
     config = PPOConfig(
         n_envs=2, n_steps=8, batch_size=4, n_epochs=3, learning_rate=(4e-3, 2e-3), gamma=0.9, gae_lambda=0.8,
-        clip_range=0.3, target_kl=0.07, entropy=(0.01, 0.0), log_std=-0.5, hidden=(16, 8),
+        clip_range=0.3, target_kl=0.07, entropy=(0.01, 0.0), log_std=-0.5, hidden=(16, 8), activation="leaky_relu",
         reward_scale=0.25, start_energy=7.0, start_share=0.5, timesteps=6000,
     )  # fmt: skip
     model = make_model(SNAKEBOARD, config, 3)
@@ -146,7 +146,7 @@ def test_settings_reach_the_algorithm():
     assert [model.lr_schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([4e-3, 3e-3, 2e-3])
     assert model.policy.log_std.tolist() == [-0.5, -0.5]
     for net in (model.policy.mlp_extractor.policy_net, model.policy.mlp_extractor.value_net):
-        assert [type(layer) for layer in net] == [torch.nn.Linear, torch.nn.Tanh] * 2
+        assert [type(layer) for layer in net] == [torch.nn.Linear, torch.nn.LeakyReLU] * 2
         assert [layer.out_features for layer in net[::2]] == [16, 8]
 
 
