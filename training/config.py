@@ -268,7 +268,7 @@ CONFIGS: dict[str, TaskConfig] = {
         # Of random searches on tuning seeds: large steps, and few environments, so that there are many updates.
         sprint_of={
             "snakeboard, drag": PPOConfig(
-                timesteps=450_000,
+                timesteps=500_000,
                 n_envs=32,
                 learning_rate=(7e-3, 3e-4),
                 gamma=0.995,
@@ -278,7 +278,7 @@ CONFIGS: dict[str, TaskConfig] = {
                 start_energy=30.0,
                 start_share=0.5,
                 activation="leaky_relu",
-                curve_every=8,
+                curve_every=16,
             ),
             "roller_racer, drag": PPOConfig(
                 timesteps=140_000,
