@@ -1,6 +1,9 @@
 import dataclasses
 import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -232,3 +235,25 @@ def test_seconds_of_a_run_do_not_count_compilation(tmp_path, monkeypatch):
     monkeypatch.setattr("training.train._clocks", lambda: order.append("looked at the clock") or {})
     Run(SNAKEBOARD, TINY, tmp_path, ignore)
     assert order == ["compiled", "looked at the clock"]
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from training.config import PPOConfig
+from training.progress import ignore
+from training.train import Run, make_model
+
+config = PPOConfig(n_envs=1, n_steps=8, batch_size=8, curve_episodes=1)
+Run("nhenv/SnakeboardForward-v0", config, Path("none"), ignore)
+before = set(sys.modules)
+make_model("nhenv/SnakeboardForward-v0", config, 0)
+print(len(set(sys.modules) - before))
+"""
+
+
+def test_the_clock_of_a_run_starts_when_all_modules_are_imported():
+    result = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True
+    )
+    assert int(result.stdout) < 10  # of some hundred that the first optimizer imports
