@@ -315,7 +315,7 @@ CONFIGS: dict[str, TaskConfig] = {
         gaits={"sinusoid 2:1": _gait(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")},
         ppo=_TURN,
         # With drag nothing coasts back to the start: coming back takes long, and pays late.
-        ppo_of={"snakeboard, drag": dataclasses.replace(_TURN, gamma=0.995)},
+        ppo_of={"snakeboard, drag": dataclasses.replace(_TURN, gamma=0.995, gae_lambda=0.9)},
         evaluation=_JUDGED_OFTEN,
     ),
     "Park": TaskConfig(
