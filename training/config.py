@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
 
@@ -39,6 +39,8 @@ __all__ = [
 SEEDS_PER_RUN = 1_000  # run s trains on the seeds from s * SEEDS_PER_RUN
 TUNING_SEEDS = 10_000_000  # where gaits are tuned and learning curves are drawn
 EVALUATION_SEEDS = 20_000_000
+
+Activation = Literal["tanh", "leaky_relu"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,10 +196,14 @@ class PPOConfig:
     start_offset: float = 0.0
     start_share: float = 0.8
     hidden: tuple[int, ...] = (64, 64)
-    activation: Literal["tanh", "leaky_relu"] = "tanh"
+    activation: Activation = "tanh"
     curve_every: int = 10
     curve_episodes: int = 8
     checkpoint_every: int = 20
+
+    def __post_init__(self) -> None:
+        if self.activation not in get_args(Activation):
+            raise ValueError(unknown_name("activation", self.activation, get_args(Activation)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -85,7 +85,7 @@ def parsed(name: str, text: str) -> Any:
     default = getattr(PPOConfig(), name)
     try:
         if ends := re.fullmatch(r"(.+)\.\.(.+)", text):
-            if isinstance(default, tuple):
+            if isinstance(default, tuple | str):
                 raise ValueError
             return Range(name, float(ends[1]), float(ends[2]), isinstance(default, int))
         if isinstance(default, tuple):
@@ -95,6 +95,7 @@ def parsed(name: str, text: str) -> Any:
         if str(problem).startswith(f"{name}:"):
             raise
         several = ", with commas between" if isinstance(default, tuple) else ", or a range LOW..HIGH"
+        several = "" if isinstance(default, str) else several
         raise ValueError(f"{name}: expected a value such as {_text(default)}{several}; got {text!r}") from None
 
 

@@ -54,10 +54,13 @@ def test_misspelt_id_is_answered_with_the_right_one():
         check_env_id("nhenv/SnakebordForward-v0")
 
 
+CHANGED = {"activation": "leaky_relu"}  # which cannot be anything
+
+
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PPOConfig)])
 def test_path_of_a_run_depends_on_every_setting(tmp_path, name):
     config = PPOConfig()
-    other = dataclasses.replace(config, **{name: changed(getattr(config, name))})
+    other = dataclasses.replace(config, **{name: CHANGED.get(name) or changed(getattr(config, name))})
     assert ppo_path(SNAKEBOARD, config, 0, tmp_path) != ppo_path(SNAKEBOARD, other, 0, tmp_path)
 
 
@@ -161,7 +164,7 @@ def test_a_mechanism_has_settings_of_its_own_with_drag_and_without():
 @pytest.mark.parametrize("env_id", [SNAKEBOARD, "nhenv/RollerRacerForward-v0"])
 def test_a_sprint_is_much_shorter(env_id):
     sprint, usual = (for_env(env_id, drag=True, sprint=sprint) for sprint in (True, False))
-    assert sprint.ppo.timesteps < usual.ppo.timesteps / 7
+    assert sprint.ppo.timesteps < usual.ppo.timesteps / 5
     assert sprint.ppo.env_kwargs == {"drag": True}
     assert sprint == dataclasses.replace(usual, ppo=sprint.ppo)
 

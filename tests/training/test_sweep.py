@@ -50,11 +50,17 @@ def test_values_are_read_as_the_settings_have_them():
         ("learning_rate", "1e-4..1e-3", "learning_rate: expected"),
         ("clip_range", "0.3..0.1", "clip_range: a range is LOW..HIGH"),
         ("gamma", "0.9..1", "must end below 1"),
+        ("activation", "1..2", "activation: expected a value such as tanh; got"),
     ],
 )
 def test_wrong_values_are_answered_with_right_ones(name, text, problem):
     with pytest.raises(ValueError, match=problem):
         parsed(name, text)
+
+
+def test_misspelt_activations_are_answered_with_what_was_meant():
+    with pytest.raises(ValueError, match=r"known: tanh, leaky_relu\. Did you mean 'leaky_relu'\?"):
+        Sweep(env_id=SNAKEBOARD, fields={"activation": ("leaky-relu",)})
 
 
 def test_values_make_a_grid():
