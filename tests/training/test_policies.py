@@ -70,6 +70,8 @@ def test_it_acts_as_stable_baselines_does(activation, exported):
     with torch.no_grad():  # as decided as a policy is after a long training, and clipped now and then
         torch.manual_seed(0)
         torch.nn.init.normal_(model.policy.action_net.weight, std=0.5)
+        for layer in model.policy.mlp_extractor.policy_net[::2]:  # whose biases are zero before any training
+            torch.nn.init.normal_(layer.bias, std=0.5)
     told, layers = actor(PolicyController(model))
     network = policy.card["network"] | {"activation": told}
     policy = read(dict(policy.card, sha256=digest_of(model), network=network), pack(layers))
