@@ -271,7 +271,7 @@ CONFIGS: dict[str, TaskConfig] = {
             "roller_racer": PPOConfig(timesteps=1_500_000, reward_scale=0.02, entropy=(0.02, 0.0), start_energy=20.0),
             "roller_racer, drag": PPOConfig(reward_scale=0.05, entropy=(0.06, 0.0), start_energy=8.0),
         },
-        # Of random searches on tuning seeds: large steps, and few environments, so that there are many updates.
+        # Of random searches on tuning seeds: large steps, and for the snakeboard half as many environments an update.
         sprint_of={
             "snakeboard, drag": PPOConfig(
                 timesteps=500_000,
@@ -320,7 +320,8 @@ CONFIGS: dict[str, TaskConfig] = {
     "Turn": TaskConfig(
         gaits={"sinusoid 2:1": _gait(cyclic_ratio=2.0, cyclic_by="atan2(sin_to_turn, cos_to_turn)")},
         ppo=_TURN,
-        # With drag nothing coasts back to the start: coming back takes long, and pays late.
+        # With drag nothing coasts back to the start: coming back takes long, and pays late. With a λ of 0.95 one seed
+        # of five solved 94 %.
         ppo_of={"snakeboard, drag": dataclasses.replace(_TURN, gamma=0.995, gae_lambda=0.9)},
         evaluation=_JUDGED_OFTEN,
     ),

@@ -94,9 +94,8 @@ def parsed(name: str, text: str) -> Any:
     except ValueError as problem:
         if str(problem).startswith(f"{name}:"):
             raise
-        several = ", with commas between" if isinstance(default, tuple) else ", or a range LOW..HIGH"
-        several = "" if isinstance(default, str) else several
-        raise ValueError(f"{name}: expected a value such as {_text(default)}{several}; got {text!r}") from None
+        more = {tuple: ", with commas between", str: ""}.get(type(default), ", or a range LOW..HIGH")
+        raise ValueError(f"{name}: expected a value such as {_text(default)}{more}; got {text!r}") from None
 
 
 def combinations(given: Mapping[str, Sequence[str]], draws: int) -> list[dict[str, Any]]:
