@@ -94,7 +94,7 @@ def parsed(name: str, text: str) -> Any:
     except ValueError as problem:
         if str(problem).startswith(f"{name}:"):
             raise
-        more = {tuple: ", with commas between", str: ""}.get(type(default), ", or a range LOW..HIGH")
+        more = {"tuple": ", with commas between", "str": ""}.get(type(default).__name__, ", or a range LOW..HIGH")
         raise ValueError(f"{name}: expected a value such as {_text(default)}{more}; got {text!r}") from None
 
 
