@@ -9,7 +9,8 @@ laws        laws in closed form that go farther, a file for each mechanism
 tuning      gaits and laws tuned by differential `evolution`, which `family` makes of their settings
 predictions what theory says of gaits: with `prescribed` joints, and for fast torques by `averaging`
 optimal     the strongest known way forward: `climbing` by linear programs, `shooting` through the simulator
-train       PPO with Stable-Baselines3, checkpointed, in environments that `wrappers` change
+train       PPO with Stable-Baselines3, checkpointed, in environments that `wrappers` change; its policies are in
+            `time_aware`, and in `levels` those that choose torques from a few
 sweep       PPO with many settings
 compare     all of it, in parallel (`progress`), into a table (`report`) and a figure (`plots`)
 film        films of controllers side by side; `shapes` draws their loops over height functions

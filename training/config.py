@@ -165,6 +165,7 @@ class PPOConfig:
         clip_range: clip of the probability ratio.
         target_kl: an update stops early above 1.5 times this divergence.
         entropy: weight of the policy's entropy, at the beginning and at the end, linear in between.
+        levels: the policy chooses each action from this many values, evenly from -1 to 1; 0 for a normal distribution.
         log_std: initial logarithm of the policy's standard deviation, in actions.
         reward_scale: what rewards are multiplied by. Value function and policy share a limit on the gradient, and
             returns of hundreds leave nothing of it to the policy.
@@ -190,6 +191,7 @@ class PPOConfig:
     clip_range: float = 0.2
     target_kl: float = 0.03
     entropy: tuple[float, float] = (0.0, 0.0)
+    levels: int = 0
     log_std: float = 0.0
     reward_scale: float = 1.0
     start_energy: float = 0.0
@@ -204,6 +206,8 @@ class PPOConfig:
     def __post_init__(self) -> None:
         if self.activation not in get_args(Activation):
             raise ValueError(unknown_name("activation", self.activation, get_args(Activation)))
+        if self.levels < 0 or self.levels == 1:
+            raise ValueError(f"levels must be 0 or at least 2, got {self.levels}")
 
 
 @dataclass(frozen=True, kw_only=True)

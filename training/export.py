@@ -24,6 +24,7 @@ from torch import nn
 from training import policies
 from training.config import EVALUATION_SEEDS, check_env_id, for_env
 from training.evaluate import evaluate, load_policy
+from training.levels import LevelPolicy
 from training.metrics import METRICS, headline, metric_of, metrics_of
 from training.report import cell, markdown_table
 from training.rollout import PolicyController, make_envs
@@ -34,8 +35,8 @@ from training.train import MODULES
 __all__ = ["actor", "card_text", "chosen", "export"]
 
 
-def actor(controller: PolicyController) -> tuple[str, policies.Layers]:
-    """Activation and layers of the network behind the mean action.
+def actor(controller: PolicyController) -> tuple[dict[str, Any], policies.Layers]:
+    """Network behind the deterministic action, as a card tells of it, and its layers.
 
     Raises:
         ValueError: it is something else than linear layers with one of the activations between them.
@@ -53,7 +54,9 @@ def actor(controller: PolicyController) -> tuple[str, policies.Layers]:
             f"only networks of linear layers with one of {list(MODULES)} between them can be exported, got "
             f"{policy.features_extractor}, {net}, {head}, squash_output={policy.squash_output}"
         )
-    return fitting[0], [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in linear]
+    layers = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in linear]
+    network = {"activation": fitting[0], "layers": [linear[0].in_features, *(layer.out_features for layer in linear)]}
+    return network | ({"levels": policy.levels} if isinstance(policy, LevelPolicy) else {}), layers
 
 
 def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 100, why: str = "") -> Path:
@@ -78,7 +81,7 @@ def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 10
             raise ValueError(f"{path} learned with another {part} of {env_id} than there is now: train it again")
     controller = load_policy(path)
     assert isinstance(controller, PolicyController)
-    activation, layers = actor(controller)
+    network, layers = actor(controller)
     envs, content = make_envs(env_id, 1, **env_kwargs), policies.pack(layers)
     card: dict[str, Any] = {
         "format": policies.FORMAT,
@@ -86,7 +89,7 @@ def export(path: Path, out: Path, *, name: str | None = None, episodes: int = 10
         "env_kwargs": env_kwargs,
         "observation": list(envs.observation_labels),
         "action": list(envs.mechanism.controls),
-        "network": {"activation": activation, "layers": [layers[0][0].shape[1], *(len(bias) for _, bias in layers)]},
+        "network": network,
         "sha256": hashlib.sha256(content).hexdigest(),
         "chosen": why,
         "training": {
@@ -160,6 +163,8 @@ def card_text(card: Mapping[str, Any], name: str) -> str:
     figures.append((f"{first.heading}, at a tenth of the step", first.statistic, cell(fine, first)))
     libraries = ", ".join(f"{library} {version}" for library, version in training["versions"].items())
     set_to = [(key, json.dumps(value)) for key, value in training["settings"].items()]
+    levels = card["network"].get("levels")
+    chosen_from = f", each one of {levels} values" if levels else ""
     lines = [
         f"# {name}",
         "",
@@ -167,7 +172,7 @@ def card_text(card: Mapping[str, Any], name: str) -> str:
         + (f" with `{made_with}`" if made_with else "")
         + f": a {card['network']['activation'].replace('_', ' ')} network of sizes "
         f"{card['network']['layers']}, from {', '.join(card['observation'])} to {', '.join(card['action'])} over their "
-        "limits. It learned in simulation alone; of a machine it knows nothing.",
+        f"limits{chosen_from}. It learned in simulation alone; of a machine it knows nothing.",
         "",
         "```python",
         "from training.policies import load",

@@ -48,7 +48,10 @@ class PolicyError(ValueError):
 
 
 class Policy:
-    """The mean action of a network: a function, and a controller of `training.rollout`.
+    """The action of a network: a function, and a controller of `training.rollout`.
+
+    It is the mean action; with "levels" in the card's network, the outputs are preferences for that many values of each
+    action, evenly from -1 to 1, and the preferred ones are taken.
 
     Args:
         card: what `training.export` wrote beside the weights; "network" and "observation" are used here.
@@ -61,6 +64,8 @@ class Policy:
     def __init__(self, card: Mapping[str, Any], layers: Layers) -> None:
         self.card = card
         self._activation = ACTIVATIONS[card["network"]["activation"]]
+        levels = card["network"].get("levels")
+        self._values = None if levels is None else np.linspace(-1, 1, levels, dtype=np.float32)
         # In float64, so that what is left of a difference to another library is that library's rounding.
         self._layers = [(np.asarray(weight, float).T.copy(), np.asarray(bias, float)) for weight, bias in layers]
 
@@ -76,7 +81,10 @@ class Policy:
         *hidden, (weight, bias) = self._layers
         for inner, shift in hidden:
             values = self._activation(values @ inner + shift)
-        return np.clip(values @ weight + bias, -1, 1).astype(np.float32)
+        values = values @ weight + bias
+        if self._values is not None:
+            return self._values[values.reshape(*values.shape[:-1], -1, len(self._values)).argmax(-1)]
+        return np.clip(values, -1, 1).astype(np.float32)
 
     def require(self, labels: Sequence[str]) -> None:
         """Raise ValueError unless these are the labels of what the policy learned to observe."""
@@ -178,6 +186,11 @@ def _checked(card: Any) -> list[int]:
             f"the card's layers must be the sizes of {len(card['observation'])} observations, of hidden layers and of "
             f"the action, got {_short(sizes)}"
         )
+    if (levels := network.get("levels")) is not None:
+        if not isinstance(levels, int) or levels < 2 or sizes[-1] % levels:
+            raise PolicyError(
+                f"the card's levels must be a number above 1 that divides {sizes[-1]} outputs, got {_short(levels)}"
+            )
     return list(sizes)
 
 

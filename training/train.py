@@ -33,6 +33,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from nhenv.sb3 import make_sb3_vec_env
 from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
+from training.levels import LevelPolicy
 from training.metrics import headline, measure
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.rollout import PolicyController, recorded, rollout
@@ -43,7 +44,7 @@ from training.wrappers import Clock, MovingStarts, ScaledReward
 __all__ = ["MODULES", "arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
 # Whatever a trained policy follows from here: what it learns in, and by what the best of the curve is chosen.
-_MODULES = ("train", "wrappers", "time_aware", "rollout", "metrics")
+_MODULES = ("train", "wrappers", "time_aware", "levels", "rollout", "metrics")
 _CODE = source_digest(*(Path(__file__).with_name(f"{name}.py") for name in _MODULES))
 
 # By `PPOConfig.activation`.
@@ -195,7 +196,11 @@ def arguments(config: PPOConfig) -> dict[str, Any]:
 def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
     """An untrained model."""
     envs = make_envs_to_learn_in(env_id, config, seed)
-    return PPO(TimeAwareCritic, envs, seed=training_seed(seed), device="cpu", **arguments(config))
+    options = arguments(config)
+    policy = LevelPolicy if config.levels else TimeAwareCritic
+    if config.levels:
+        options["policy_kwargs"]["levels"] = config.levels
+    return PPO(policy, envs, seed=training_seed(seed), device="cpu", **options)
 
 
 def train_piece(

@@ -64,16 +64,15 @@ def observations_like(labels, count=2000):
     return np.random.default_rng(0).normal(0, 2, (count, len(labels))).astype(np.float32)
 
 
-@pytest.mark.parametrize("activation", policies.ACTIVATIONS)
-def test_it_acts_as_stable_baselines_does(activation, exported):
-    model, policy = make_model(SNAKEBOARD, dataclasses.replace(TINY, activation=activation), 0), load(exported)
+@pytest.mark.parametrize("changes", [*({"activation": name} for name in policies.ACTIVATIONS), {"levels": 3}])
+def test_it_acts_as_stable_baselines_does(changes, exported):
+    model, policy = make_model(SNAKEBOARD, dataclasses.replace(TINY, **changes), 0), load(exported)
     with torch.no_grad():  # as decided as a policy is after a long training, and clipped now and then
         torch.manual_seed(0)
         torch.nn.init.normal_(model.policy.action_net.weight, std=0.5)
         for layer in model.policy.mlp_extractor.policy_net[::2]:  # whose biases are zero before any training
             torch.nn.init.normal_(layer.bias, std=0.5)
-    told, layers = actor(PolicyController(model))
-    network = policy.card["network"] | {"activation": told}
+    network, layers = actor(PolicyController(model))
     policy = read(dict(policy.card, sha256=digest_of(model), network=network), pack(layers))
     observations = observations_like(policy.card["observation"])
     expected = model.predict(observations, deterministic=True)[0]
@@ -86,6 +85,21 @@ def test_it_acts_as_stable_baselines_does(activation, exported):
 
 def digest_of(model):
     return hashlib.sha256(pack(actor(PolicyController(model))[1])).hexdigest()
+
+
+def test_preferred_levels_are_what_the_formula_says():
+    layers = [(np.eye(2), np.zeros(2)), (np.array([[1, 0], [0, 1], [1, 1], [0, 0], [-1, 0], [0, -1.0]]), np.zeros(6))]
+    content = pack(layers)
+    policies_of = {
+        levels: read(card_of(content, network={"activation": "tanh", "layers": [2, 2, 6], "levels": levels}), content)
+        for levels in (2, 3)
+    }
+    # Of (1, 2) in units of the activation the outputs are 1, 2, 3, 0, -1, -2.
+    assert policies_of[3]([0.1, 0.2]).tolist() == [1, -1]
+    assert policies_of[2]([0.1, 0.2]).tolist() == [1, -1, -1]
+    assert policies_of[3]([[-0.1, 0.2], [0.1, -0.3]]).tolist() == [[0, 0], [-1, 1]]
+    assert policies_of[3](np.zeros((4, 3, 2))).shape == (4, 3, 2)
+    assert policies_of[3]([0.1, 0.2]).dtype == np.float32
 
 
 def test_it_drives_as_the_policy_it_was(trained, exported):
@@ -285,6 +299,11 @@ HOSTILE_CARDS = {
     "got [2]": {"network": {"activation": "tanh", "layers": [2]}},
     "got [2, -3, 1]": {"network": {"activation": "tanh", "layers": [2, -3, 1]}},
     "got 7": {"network": {"activation": "tanh", "layers": 7}},
+    "divides 1 outputs, got 2": {"network": {"activation": "tanh", "layers": [2, 3, 1], "levels": 2}},
+    "a number above 1 that divides 1 outputs, got 1": {
+        "network": {"activation": "tanh", "layers": [2, 3, 1], "levels": 1}
+    },
+    "outputs, got [3]": {"network": {"activation": "tanh", "layers": [2, 3, 1], "levels": [3]}},
     "damaged or was replaced": {"sha256": "0" * 64},
     "must be float32 of shape (1000000000, 2)": {"network": {"activation": "tanh", "layers": [2, 10**9, 1]}},
 }
