@@ -169,6 +169,7 @@ class PPOConfig:
         log_std: initial logarithm of the policy's standard deviation, in actions.
         reward_scale: what rewards are multiplied by. Value function and policy share a limit on the gradient, and
             returns of hundreds leave nothing of it to the policy.
+        observation_scale: label of an observation -> what it is multiplied by for the networks; 1 where there is none.
         start_energy: J; episodes begin in motion, with up to this much, ever fewer of them; 0 for none.
         start_offset: m; these begin up to this far, along x and along y, from where their targets are drawn.
         start_share: part of the training after which all begin at rest; beyond 1, some always begin in motion.
@@ -194,6 +195,7 @@ class PPOConfig:
     levels: int = 0
     log_std: float = 0.0
     reward_scale: float = 1.0
+    observation_scale: dict[str, float] = field(default_factory=dict)
     start_energy: float = 0.0
     start_offset: float = 0.0
     start_share: float = 0.8

@@ -19,6 +19,7 @@ from typing import Any
 
 import tyro
 from rich.console import Console
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from training import policies
@@ -28,6 +29,7 @@ from training.levels import LevelPolicy
 from training.metrics import METRICS, headline, metric_of, metrics_of
 from training.report import cell, markdown_table
 from training.rollout import PolicyController, make_envs
+from training.scaling import Scaled
 from training.statistics import median_run, summary
 from training.store import read_json, settings, versions, write_bytes, write_json
 from training.train import MODULES
@@ -45,16 +47,20 @@ def actor(controller: PolicyController) -> tuple[dict[str, Any], policies.Layers
     net, head = policy.mlp_extractor.policy_net, policy.action_net
     inner, between = [*net.children()][::2], [*net.children()][1::2]
     linear = [layer for layer in (*inner, head) if isinstance(layer, nn.Linear)]
-    plain = type(policy.features_extractor).__name__ == "FlattenExtractor" and not policy.squash_output
+    extractor = policy.features_extractor
+    plain = type(extractor) in (FlattenExtractor, Scaled) and not policy.squash_output
     plain &= len(linear) == len(inner) + 1 == len(between) + 1
     # A module's text tells its slope, too.
     fitting = [name for name, module in MODULES.items() if all(repr(one) == repr(module()) for one in between)]
     if not (plain and fitting):
         raise ValueError(
             f"only networks of linear layers with one of {list(MODULES)} between them can be exported, got "
-            f"{policy.features_extractor}, {net}, {head}, squash_output={policy.squash_output}"
+            f"{extractor}, {net}, {head}, squash_output={policy.squash_output}"
         )
     layers = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in linear]
+    if isinstance(extractor, Scaled):  # whose factors are as good in the first layer
+        (weight, bias), *others = layers
+        layers = [(weight * extractor.factors.numpy()[: weight.shape[1]], bias), *others]
     network = {"activation": fitting[0], "layers": [linear[0].in_features, *(layer.out_features for layer in linear)]}
     return network | ({"levels": policy.levels} if isinstance(policy, LevelPolicy) else {}), layers
 

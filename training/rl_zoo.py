@@ -26,10 +26,11 @@ FILE = Path(__file__).with_name("rl_zoo.yml")
 
 HEADER = """\
 # PPO for the environments of nhenv, in the format of RL Baselines3 Zoo. Written by `python -m training.rl_zoo`;
-# do not edit. What the format cannot say: learning rates fall to zero there, here to {last}; the weight of the
-# entropy falls to zero here; here the value function sees how much of an episode is over, and the time limit is an
-# end; without that a smaller gamma may do better. First episodes have random lengths here, some begin in motion,
-# rewards are scaled, the best policy of the learning curve is kept, and all environments are stepped by one call.
+# do not edit. What the format cannot say: learning rates fall to zero there, here to {last}; the
+# weight of the entropy falls to zero here; here the value function sees how much of an episode is over, and the time
+# limit is an end; without that a smaller gamma may do better. First episodes have random lengths here, some begin in
+# motion, rewards are scaled, for some tasks observations too, and torques are chosen from a few levels; the best policy
+# of the learning curve is kept, and all environments are stepped by one call.
 """
 
 
@@ -41,7 +42,8 @@ def entry(config: PPOConfig) -> dict[str, str]:
 
 def text() -> str:
     """Content of the file: settings by task, and the environments that have it."""
-    last = sorted({config.ppo.learning_rate[1] for config in CONFIGS.values()})
+    written = [one for config in CONFIGS.values() for one in (config.ppo, *config.ppo_of.values())]
+    last = sorted({one.learning_rate[1] for one in written})
     lines = [HEADER.format(last=" or ".join(f"{rate:g}" for rate in last))]
     for task, config in CONFIGS.items():
         lines += [f"{task}: &{task}", *(f"  {name}: {value}" for name, value in entry(config.ppo).items()), ""]

@@ -43,8 +43,8 @@ from training.train import ppo_path, train_piece
 
 __all__ = ["Range", "Sweep", "combinations", "parsed", "sweep"]
 
-# Swept by name; what an environment is made with is the same for all.
-FIELDS = tuple(f.name for f in dataclasses.fields(PPOConfig) if f.name != "env_kwargs")
+# Swept by name; what an environment is made with and how it is seen are the same for all.
+FIELDS = tuple(f.name for f in dataclasses.fields(PPOConfig) if f.name not in ("env_kwargs", "observation_scale"))
 # Of these, what is missing to 1 is drawn evenly in its logarithm: 0.99 to 0.999 is as far as 0.999 to 0.9999.
 DISCOUNTS = ("gamma", "gae_lambda")
 DIGITS = 3  # of a number that is drawn; of what is missing to 1 of a discount

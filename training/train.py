@@ -30,6 +30,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
+from mechanics.expressions import unknown_name
 from nhenv.sb3 import make_sb3_vec_env
 from nhenv.vector_env import LocomotionVectorEnv
 from training.config import TUNING_SEEDS, PPOConfig, check_env_id, for_env, training_seed
@@ -37,6 +38,7 @@ from training.levels import LevelPolicy
 from training.metrics import headline, measure
 from training.progress import Interrupted, Job, Report, ignore, run_jobs
 from training.rollout import PolicyController, recorded, rollout
+from training.scaling import Scaled
 from training.store import piece_path, settings, source_digest, versions, write_bytes, write_json
 from training.time_aware import TimeAwareCritic
 from training.wrappers import Clock, MovingStarts, ScaledReward
@@ -44,7 +46,7 @@ from training.wrappers import Clock, MovingStarts, ScaledReward
 __all__ = ["MODULES", "arguments", "check_tensorboard", "make_model", "ppo_path", "ppo_settings", "train_piece"]
 
 # Whatever a trained policy follows from here: what it learns in, and by what the best of the curve is chosen.
-_MODULES = ("train", "wrappers", "time_aware", "levels", "rollout", "metrics")
+_MODULES = ("train", "wrappers", "time_aware", "levels", "scaling", "rollout", "metrics")
 _CODE = source_digest(*(Path(__file__).with_name(f"{name}.py") for name in _MODULES))
 
 # By `PPOConfig.activation`.
@@ -200,7 +202,21 @@ def make_model(env_id: str, config: PPOConfig, seed: int) -> PPO:
     policy = LevelPolicy if config.levels else TimeAwareCritic
     if config.levels:
         options["policy_kwargs"]["levels"] = config.levels
+    if config.observation_scale:
+        options["policy_kwargs"] |= {
+            "features_extractor_class": Scaled,
+            "features_extractor_kwargs": {"factors": _factors(config, envs)},
+        }
     return PPO(policy, envs, seed=training_seed(seed), device="cpu", **options)
+
+
+def _factors(config: PPOConfig, envs: VecEnv) -> list[float]:
+    """What each observation is multiplied by; the last one is the time."""
+    (labels,) = envs.get_attr("observation_labels", 0)
+    for name in config.observation_scale:
+        if name not in labels:
+            raise ValueError(f"observation_scale: {unknown_name('observation', name, labels)}")
+    return [float(config.observation_scale.get(label, 1)) for label in labels] + [1.0]
 
 
 def train_piece(

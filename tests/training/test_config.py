@@ -8,7 +8,7 @@ import mechanics
 import nhenv
 from nhenv import tasks
 from training import config as config_module
-from training import levels, metrics, rollout, time_aware, train, tuning, wrappers
+from training import levels, metrics, rollout, scaling, time_aware, train, tuning, wrappers
 from training.config import (
     COMPARED,
     CONFIGS,
@@ -106,7 +106,8 @@ def test_paths_depend_on_where_the_seeds_of_environments_begin(tmp_path, monkeyp
 
 
 def test_code_of_a_result_is_that_of_all_modules_from_which_it_follows():
-    made_of = source_digest(*(module.__file__ for module in (train, wrappers, time_aware, levels, rollout, metrics)))
+    modules = (train, wrappers, time_aware, levels, scaling, rollout, metrics)
+    made_of = source_digest(*(module.__file__ for module in modules))
     assert ppo_settings(SNAKEBOARD, PPOConfig(), 0)["code"] == made_of
 
 

@@ -64,7 +64,15 @@ def observations_like(labels, count=2000):
     return np.random.default_rng(0).normal(0, 2, (count, len(labels))).astype(np.float32)
 
 
-@pytest.mark.parametrize("changes", [*({"activation": name} for name in policies.ACTIVATIONS), {"levels": 3}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"activation": name} for name in policies.ACTIVATIONS),
+        {"levels": 3},
+        {"observation_scale": {"phi": 3.0, "speed": 0.5}},
+    ],
+    ids=str,
+)
 def test_it_acts_as_stable_baselines_does(changes, exported):
     model, policy = make_model(SNAKEBOARD, dataclasses.replace(TINY, **changes), 0), load(exported)
     with torch.no_grad():  # as decided as a policy is after a long training, and clipped now and then

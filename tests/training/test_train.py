@@ -171,6 +171,23 @@ def test_the_value_function_sees_the_time_and_the_policy_does_not():
     assert model.predict(shown[0, :-1].numpy(), deterministic=True)[0].shape == (2,)
 
 
+def test_networks_see_scaled_observations():
+    scaled = dataclasses.replace(TINY, observation_scale={"phi_dot": 4.0, "psi_dot": 0.5})
+    models = [make_model(SNAKEBOARD, config, 0).policy for config in (scaled, TINY)]
+    models[1].load_state_dict({name: value for name, value in models[0].state_dict().items() if "factors" not in name})
+    shown = torch.tensor(np.random.default_rng(0).normal(size=(50, 7)), dtype=torch.float32)
+    factors = torch.tensor([1.0, 4.0, 0.5, 1.0, 1.0, 1.0, 1.0])  # phi, phi_dot, psi_dot, speed, heading, time
+    for ours, theirs in zip(models[0](shown, True), models[1](shown * factors, True), strict=True):
+        assert torch.equal(ours, theirs)
+    assert not torch.equal(models[0](shown, True)[0], models[1](shown, True)[0])
+
+
+def test_a_misspelt_observation_is_answered_with_what_was_meant():
+    config = dataclasses.replace(TINY, observation_scale={"phi_dott": 4.0})
+    with pytest.raises(ValueError, match="observation_scale: unknown observation 'phi_dott'.* Did you mean 'phi_dot'"):
+        make_model(SNAKEBOARD, config, 0)
+
+
 def test_entropy_falls_from_its_first_value_to_its_last(tmp_path):
     config = dataclasses.replace(TINY, entropy=(0.4, 0.2))
     heard = []
