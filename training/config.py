@@ -262,6 +262,7 @@ _JUDGED_OFTEN = EvaluationConfig(episodes=1000)
 _VARIED = PPOConfig(
     timesteps=1_000_000, gamma=0.99, reward_scale=0.1, entropy=(0.01, 0.0), start_energy=4.0, curve_episodes=64
 )
+_GOAL = dataclasses.replace(_VARIED, entropy=(0.02, 0.0))
 _TURN = dataclasses.replace(_VARIED, timesteps=5_000_000, entropy=(0.04, 0.0), start_offset=0.3)
 _gait = partial(GaitConfig, starts=16)
 
@@ -270,11 +271,21 @@ CONFIGS: dict[str, TaskConfig] = {
         ppo=PPOConfig(reward_scale=0.05, entropy=(0.02, 0.0)),
         # What lasts longer is worth more: without drag rewards and energies are larger.
         ppo_of={
-            "snakeboard": PPOConfig(reward_scale=0.02, entropy=(0.02, 0.0), start_energy=150.0),
+            "snakeboard": PPOConfig(
+                learning_rate=(3e-3, 1e-4),
+                gamma=0.9995,
+                reward_scale=0.02,
+                entropy=(0.006, 0.0),
+                levels=3,
+                observation_scale={"phi": 5.0, "phi_dot": 4.0, "sin_heading": 4.0},  # which are small once it goes
+                start_energy=150.0,
+            ),
             "snakeboard, drag": PPOConfig(
                 timesteps=3_500_000, reward_scale=0.05, entropy=(0.02, 0.0), start_energy=30.0, activation="leaky_relu"
             ),
-            "roller_racer": PPOConfig(timesteps=1_500_000, reward_scale=0.02, entropy=(0.02, 0.0), start_energy=20.0),
+            "roller_racer": PPOConfig(
+                timesteps=1_500_000, reward_scale=0.02, entropy=(0.005, 0.0), levels=3, start_energy=20.0
+            ),
             "roller_racer, drag": PPOConfig(reward_scale=0.05, entropy=(0.06, 0.0), start_energy=8.0),
         },
         # Of random searches on tuning seeds: large steps, and for the snakeboard half as many environments an update.
@@ -319,7 +330,12 @@ CONFIGS: dict[str, TaskConfig] = {
             # To a goal behind it goes backwards, if the mechanism can.
             "steered either way": _gait(steered=True, steered_by="goal_left", limited_by="goal_ahead"),
         },
-        ppo=dataclasses.replace(_VARIED, entropy=(0.02, 0.0)),
+        ppo=_GOAL,
+        # Where nothing coasts, time is lost with every torque below its limit.
+        ppo_of={
+            "snakeboard, drag": dataclasses.replace(_GOAL, levels=3),
+            "roller_racer, drag": dataclasses.replace(_GOAL, levels=3),
+        },
         evaluation=_JUDGED_OFTEN,
     ),
     # Ostrowski's gaits: what is left to turn, or to go sideways, decides how large they are and which way they work.
