@@ -1,7 +1,7 @@
 """A policy that chooses each torque from a few levels.
 
-Laws of the largest distance are bang-bang: a normal distribution has to learn means far beyond the limits to say so,
-and explores little there. (Seyde et al., *Is bang-bang control all you need?*, 2021.)
+The laws that go farthest are bang-bang: a normal distribution has to learn means far beyond the limits to say so, and
+explores little there. (Seyde et al., *Is bang-bang control all you need?*, 2021.)
 """
 
 from __future__ import annotations

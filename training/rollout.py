@@ -32,7 +32,7 @@ class Controller(Protocol):
 
 
 class PolicyController:
-    """The mean action of a policy of Stable-Baselines3."""
+    """The action that a policy of Stable-Baselines3 prefers: the mean, or the most probable one."""
 
     def __init__(self, model: PPO) -> None:
         self.model = model
