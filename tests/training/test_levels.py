@@ -9,6 +9,7 @@ from torch.distributions import Categorical
 from training.config import PPOConfig
 from training.evaluate import load_policy
 from training.levels import LevelPolicy
+from training.progress import Interrupted
 from training.store import read_json
 from training.train import make_model, ppo_path, train_piece
 
@@ -37,6 +38,10 @@ def strangers(policy, shown):
     """PyTorch's own distribution over the indices of the values, of each action."""
     logits = policy.action_net(policy.mlp_extractor.forward_actor(shown))
     return Categorical(logits=logits.reshape(len(shown), 2, 5))
+
+
+def parameters(model):
+    return torch.cat([value.flatten() for value in model.policy.parameters()])
 
 
 def test_probabilities_are_those_of_a_stranger(model):
@@ -102,6 +107,25 @@ def test_a_policy_that_is_read_back_chooses_the_same(tmp_path):
     trained.model.policy.save(tmp_path / "policy.pt")
     again = LevelPolicy.load(tmp_path / "policy.pt")
     assert np.array_equal(again.predict(shown, deterministic=True)[0], chosen)
+
+
+def test_interrupted_run_ends_as_if_it_had_not_been(tmp_path):
+    config = dataclasses.replace(TINY, observation_scale={"phi": 3.0})
+
+    def interrupt(done, total, text):
+        if done == 256:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        train_piece(SNAKEBOARD, config, 0, tmp_path / "interrupted", interrupt)
+    for folder in ("interrupted", "whole"):
+        train_piece(SNAKEBOARD, config, 0, tmp_path / folder)
+    ends = [
+        parameters(load_policy(ppo_path(SNAKEBOARD, config, 0, tmp_path / folder).with_suffix(".zip")).model)
+        for folder in ("interrupted", "whole")
+    ]
+    assert torch.equal(*ends)
+    assert not torch.equal(ends[0], parameters(make_model(SNAKEBOARD, config, 0)))
 
 
 @pytest.mark.parametrize("levels", [1, -3])
