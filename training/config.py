@@ -288,16 +288,17 @@ CONFIGS: dict[str, TaskConfig] = {
             ),
             "roller_racer, drag": PPOConfig(reward_scale=0.05, entropy=(0.06, 0.0), start_energy=8.0),
         },
-        # Of random searches on tuning seeds: large steps, and for the snakeboard half as many environments an update.
+        # Of random searches on tuning seeds: large steps, few levels, for the snakeboard half as many environments.
         sprint_of={
             "snakeboard, drag": PPOConfig(
                 timesteps=500_000,
                 n_envs=32,
-                learning_rate=(7e-3, 3e-4),
+                learning_rate=(4e-3, 3e-4),
                 gamma=0.995,
                 gae_lambda=0.93,
                 reward_scale=0.05,
                 entropy=(0.01, 0.0),
+                levels=3,
                 start_energy=30.0,
                 start_share=0.5,
                 activation="leaky_relu",
@@ -310,6 +311,7 @@ CONFIGS: dict[str, TaskConfig] = {
                 gamma=0.97,
                 reward_scale=0.05,
                 entropy=(0.01, 0.0),
+                levels=3,
                 hidden=(32, 32),
                 curve_every=2,
             ),
