@@ -106,7 +106,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     | | `reward_goal` | `goal_reward_weight` on the step that reaches the goal, else 0 |
     | Turn | `reward_heading` | `-heading_cost_weight * abs(e) / pi` |
     | | `reward_offset` | `-offset_cost_weight * d` |
-    | | `reward_arrival` | `arrival_reward_weight * exp(-(e/heading_tolerance)**2)` |
+    | | `reward_arrival` | `arrival_reward_weight * exp(-(d/offset_tolerance)**2 - (e/heading_tolerance)**2)` |
     | Park | `reward_progress` | `progress_reward_weight * (d_before - d) / dt` |
     | | `reward_near` | `near_reward_weight * exp(-(d/0.2)**2) * (0.25 + 0.75*((1 + cos(e))/2)**2)` |
     | | `reward_arrival` | `arrival_reward_weight * exp(-(d/offset_tolerance)**2 - (e/heading_tolerance)**2)` |
@@ -164,7 +164,7 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         **weights: the task's weights. Forward: `forward_reward_weight=1.0`. Velocity: `velocity_cost_weight=2.0`,
             `sideways_cost_weight=0.2`. Goal: `progress_reward_weight=1.0`, `time_cost_weight=0.5`,
             `goal_reward_weight=5.0`, `goal_radius=0.15`. Turn: `heading_cost_weight=1.0`, `offset_cost_weight=0.5`,
-            `arrival_reward_weight=0.5`, `heading_tolerance=0.15`, `offset_tolerance=0.15`. Park:
+            `arrival_reward_weight=1.0`, `heading_tolerance=0.15`, `offset_tolerance=0.15`. Park:
             `progress_reward_weight=1.0`, `near_reward_weight=1.0`, `arrival_reward_weight=1.0`,
             `heading_tolerance=0.15`, `offset_tolerance=0.1`. All: `ctrl_cost_weight=0.02`.
 
