@@ -83,4 +83,4 @@ def _stepped(name: str, record: dict[str, Any], q: NDArray[np.float64], qdot: ND
 
 
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    tyro.cli(main, prog="python -m benchmarks.accuracy", description=__doc__)

@@ -278,4 +278,4 @@ def main(arguments: Arguments) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(min(main(tyro.cli(Arguments, description=__doc__)), 1))
+    sys.exit(min(main(tyro.cli(Arguments, prog="python -m benchmarks.stability", description=__doc__)), 1))

@@ -91,4 +91,4 @@ def _time(make: str, cache: str) -> float:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    main(tyro.cli(Arguments, prog="python -m benchmarks.startup", description=__doc__))

@@ -309,4 +309,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    main(tyro.cli(Arguments, prog="python -m benchmarks.throughput", description=__doc__))

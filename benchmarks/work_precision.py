@@ -396,4 +396,4 @@ def _draw(points: Sequence[Point], path: Path, notes: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    main(tyro.cli(Arguments, prog="python -m benchmarks.work_precision", description=__doc__))

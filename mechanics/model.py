@@ -141,10 +141,17 @@ def acceleration(
 
     Args:
         mechanism: what moves.
-        q: coordinates, shape (..., n).
-        qdot: feasible velocities, shape (..., n).
-        u: controls, shape (..., m).
+        q: coordinates, shape (..., n), in m and rad.
+        qdot: velocities, shape (..., n), in m/s and rad/s.
+        u: controls, shape (..., m), in N and N m.
         params: values that replace the mechanism's defaults.
+
+    Returns:
+        Accelerations, shape (..., n), in m/s² and rad/s², without drag.
+
+    Raises:
+        MechanismError: a parameter that the mechanism does not have or that is impossible, a shape that does not fit,
+            or velocities that the constraints forbid.
     """
     model = Model(mechanism, params)
     return model.acceleration(q, model.feasible(q, qdot), u)

@@ -106,4 +106,4 @@ def _operates(node: ast.AST) -> bool:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    tyro.cli(main, prog="python -m nhenv")

@@ -325,13 +325,13 @@ def _table(options: Optimal) -> Table:
     for heading in ("", "drag", "metres", "replayed", "10 steps a hold", "at the limits"):
         table.add_column(heading, justify="right" if heading else "left")
     for env_id, drag in options.cells:
-        known = load(env_id, drag, options.out)
+        known, name = load(env_id, drag, options.out), env_id.rpartition("/")[2]
         if known is None:
-            table.add_row(env_id, "yes" if drag else "no", *["-"] * 4)
+            table.add_row(name, "yes" if drag else "no", *["-"] * 4)
             continue
         again = [replay(known, **more) for more in ({}, {"substeps": 10})]
         saturated = np.mean(np.abs(known.actions) > 0.999)
-        table.add_row(env_id, "yes" if drag else "no", f"{known.distance_m:.4f}", *(f"{x:.4f}" for x in again),
+        table.add_row(name, "yes" if drag else "no", f"{known.distance_m:.4f}", *(f"{x:.4f}" for x in again),
                       f"{saturated:.0%}")  # fmt: skip
     return table
 

@@ -14,6 +14,7 @@ everything is judged in the end.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import itertools
 import os
 import re
@@ -238,7 +239,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (f.name, hints[f.name]) if f.default is dataclasses.MISSING else (f.name, hints[f.name], f.default) for f in own
     ]
     swept: list[Any] = [(name, tuple[str, ...], ()) for name in FIELDS]
-    command = dataclasses.make_dataclass("Command", entries + swept)
+    # What each option means is said where it is declared.
+    attributes = (inspect.cleandoc(str(one.__doc__)).partition("Attributes:")[2] for one in (Sweep, PPOConfig))
+    said = {"__doc__": f"Settings of a sweep.\n\nAttributes:{''.join(attributes)}"}
+    command = dataclasses.make_dataclass("Command", entries + swept, namespace=said)
     given = dict(vars(tyro.cli(command, prog="python -m training.sweep", description=__doc__, args=arguments)))
     options = Sweep(fields={name: given.pop(name) for name in FIELDS}, **given)
     called = ["python", "-m", "training.sweep", *(sys.argv[1:] if arguments is None else arguments)]

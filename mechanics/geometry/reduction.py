@@ -126,6 +126,9 @@ def reduce(
 
     Returns:
         The reduced equations, in compact form.
+
+    Raises:
+        MechanismError: a frame that the mechanism does not have, or whose fields do not span D.
     """
     return derive(mechanism, frame, drag=drag).written_out()
 
