@@ -233,7 +233,7 @@ class TaskConfig:
     """Settings of every part of an experiment on one task.
 
     Attributes:
-        gaits: by name, with equal budgets; each where it fits the mechanism. The first is drawn beside the policy.
+        gaits: by name, with equal budgets; each where it fits the mechanism.
         ppo: what trains the policy.
         ppo_of: mechanism, or mechanism and ", drag" where its drag acts -> what trains its policy instead.
         sprint_of: the same -> what passes the steered gait soonest, for who would rather wait seconds than minutes.

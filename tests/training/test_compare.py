@@ -14,10 +14,11 @@ import tyro
 from rich.console import Console
 from scipy.stats import trim_mean
 
+import training.compare
 import training.evaluate
 from training import config
 from training.compare import Compare, compare, judge, strongest_known
-from training.config import EVALUATION_SEEDS, EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
+from training.config import EVALUATION_SEEDS, TUNING_SEEDS, EvaluationConfig, GaitConfig, PPOConfig, TaskConfig
 from training.evaluate import load_policy
 from training.metrics import measure
 from training.optimal import reference
@@ -99,8 +100,9 @@ def test_every_controller_is_judged_again_at_a_tenth_of_the_step(finished):
     options, *_ = finished
     asked = []
 
-    def evaluate(controller, env_id, config, **kwargs):
-        asked.append(kwargs)
+    def evaluate(controller, env_id, config, seeds=EVALUATION_SEEDS, **kwargs):
+        if seeds == EVALUATION_SEEDS:
+            asked.append(kwargs)
         return training.evaluate.evaluate(controller, env_id, config)
 
     for env_id, own in ((SNAKEBOARD, 1), ("nhenv/RollerRacerForward-v0", 2)):
@@ -123,9 +125,38 @@ def test_shares_of_the_strongest_known_and_times_to_pass_are_shown(finished):
     heading = next(line.split(" | ") for line in text.splitlines() if "of the strongest known |" in line)
     assert row[heading.index("of the strongest known")] == f"{100 * gait / 50:.1f} %"
     assert row[heading.index("PPO passes it after (CPU s)")] == "7.3"
-    lost = dict(results, environments={SNAKEBOARD: dict(one, reference=None)})
-    unknown = next(line for line in markdown(lost).splitlines() if line.startswith("| sinusoid"))
-    assert unknown.split(" | ")[heading.index("of the strongest known")] == "–"
+    unknown = markdown(dict(results, environments={SNAKEBOARD: dict(known, reference=None)}))
+    assert "| of the strongest known |" not in unknown
+    (without,) = (line.split(" | ") for line in unknown.splitlines() if line.startswith("| sinusoid"))
+    row.pop(heading.index("of the strongest known"))
+    assert without == row
+
+
+def test_a_gait_is_passed_where_the_curve_is_above_what_it_would_show_of_the_gait(finished):
+    options, results, _ = finished
+    asked, marks = [], []
+
+    def evaluate(controller, env_id, config, *, seeds=EVALUATION_SEEDS, **kwargs):
+        if seeds != EVALUATION_SEEDS:
+            asked.append((type(controller), config.episodes, seeds, kwargs))
+        return training.evaluate.evaluate(controller, env_id, config, seeds=seeds, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("training.compare.evaluate", evaluate)
+        patch.setattr("training.compare.seconds_to_pass", lambda curves, metric, mark, better: marks.append(mark))
+        patch.setattr("training.compare.draw", lambda *arguments: marks.append(arguments[-1]["sinusoid"]))
+        judge(SNAKEBOARD, options)
+    ((kind, episodes, seeds, others),) = asked
+    assert (kind.__name__, episodes, seeds, others) == ("Sinusoid", 1, TUNING_SEEDS, {})
+    assert marks[0] == marks[1]
+    # What would be shown of a policy is what its curve shows.
+    (path,) = options.out.rglob("ppo-seed0-*.zip")
+    result = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["result"]
+    (best,) = (point for point in result["curve"] if point["steps"] == result["best_steps"])
+    on_curve = dataclasses.replace(TINY.evaluation, episodes=1)
+    _, numbers = training.evaluate.evaluate(load_policy(path), SNAKEBOARD, on_curve, seeds=TUNING_SEEDS)
+    assert numbers["distance_m"].mean() == best["distance_m"]
+    assert marks[0] != results["environments"][SNAKEBOARD]["gaits"]["sinusoid"]["distance_m"]["estimate"]
 
 
 def test_the_strongest_known_is_asked_for_the_environment_that_is_judged(monkeypatch):
@@ -242,19 +273,91 @@ def test_ctrl_c_keeps_what_is_done(tmp_path):
     assert checkpoint.stat().st_size > 0
 
 
-def test_a_figure_shows_each_episode_up_to_its_own_end(tmp_path, monkeypatch):
+@pytest.mark.parametrize("best", [0, 1])
+def test_the_best_gait_is_drawn_beside_the_policy(finished, monkeypatch, best):
+    options, *_ = finished
+    gait = TINY.gaits["sinusoid"]
+    monkeypatch.setitem(config.CONFIGS, "Forward", dataclasses.replace(TINY, gaits={"one": gait, "other": gait}))
+    honest, judged, beside = training.compare._judged, [], []
+
+    def flatter(*arguments):
+        episodes, report, scores = honest(*arguments)
+        judged.append(report)
+        if len(judged) == best + 1:
+            report["distance_m"] = dict(report["distance_m"], estimate=report["distance_m"]["estimate"] + 1)
+        return episodes, report, scores
+
+    monkeypatch.setattr("training.compare._judged", flatter)
+    monkeypatch.setattr("training.compare.draw", lambda *arguments: beside.append(arguments[4]))
+    judge(SNAKEBOARD, options)
+    assert beside == [best]
+
+
+CURVE = [{"steps": steps, "cpu_s": steps, "distance_m": way, "success": way} for steps, way in ((0, -3.0), (10, 1.0))]
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Axes of the figures that are drawn, by the label of what they show up or by their title."""
+    found = {}
+
+    def keep(figure, *_, **__):
+        found.update({ax.get_title() or ax.get_ylabel(): ax for ax in figure.axes})
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", keep)
+    return found
+
+
+def episodes(steps, longest, envs, targets=None):
+    """Two episodes of random states, the first as long as this."""
+    q = np.random.default_rng(steps).normal(size=(2, longest + 1, 5))
+    torques, v = np.zeros((2, longest, 2)), np.zeros((2, longest + 1, 3))
+    return Rollout(np.zeros(2), q, torques, v, np.array([steps, longest]), targets or {}, {})
+
+
+def test_a_figure_shows_each_episode_up_to_its_own_end(tmp_path, figures):
     """Episodes of a goal do not last equally long, and of a thousand the first is seldom the longest."""
-    shown = []
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, *_, **__: shown.extend(figure.axes))
     envs = make_envs(SNAKEBOARD, 1, backend="numpy")
-
-    def one(steps, longest):
-        q = np.random.default_rng(0).normal(size=(2, longest + 1, 5))
-        ends = np.array([steps, longest])
-        return Rollout(np.zeros(2), q, np.zeros((2, longest, 2)), np.zeros((2, longest + 1, 3)), ends, {}, {})
-
-    curve = [{"steps": steps, "cpu_s": steps, "distance_m": 1.0} for steps in (0, 10)]
-    two = [Shown("gait", GAITS[0], one(20, 50)), Shown("policy", POLICY, one(30, 90))]
-    draw(tmp_path / "figure.png", "title", envs, two, [curve], {"gait": 1.0})
-    last = [max(line.get_xdata().max() for line in ax.lines) for ax in shown if "last" in ax.get_title()]
+    two = [Shown("gait", GAITS[0], episodes(20, 50, envs)), Shown("policy", POLICY, episodes(30, 90, envs))]
+    draw(tmp_path / "figure.png", "title", envs, two, 0, [CURVE], {"gait": 1.0})
+    last = [max(line.get_xdata().max() for line in ax.lines) for title, ax in figures.items() if "last 4 s" in title]
     assert last == pytest.approx([20 * envs.dt, 30 * envs.dt])
+    assert [len(line.get_xdata()) - 1 for line in figures["heading (rad)"].lines] == [20, 30]
+    x = two[1].episodes.q[0, :31, 0]
+    velocity = figures["velocity along x (m/s)"].patches[1].get_data()
+    np.testing.assert_allclose(velocity.values, np.diff(x) / envs.dt)
+
+
+def test_a_figure_shows_the_target_and_the_way_to_it(tmp_path, figures):
+    envs = make_envs("nhenv/SnakeboardTurn-v0", 1, backend="numpy")
+    targets = {"turn_size": [1.0], "turn_side": [1.0], "target_heading": [2.0], "start_x": [0.3], "start_y": [-0.1]}
+    targets = {name: np.array(values) for name, values in targets.items()}
+    shown = [Shown(name, GAITS[0], episodes(160, 160, envs, targets)) for name in ("weak", "strong", "policy")]
+    draw(tmp_path / "figure.png", "title", envs, shown, 1, [CURVE], {"weak": 0.2, "strong": 0.8})
+    assert {"strong, first 4 s", "policy, first 4 s"} < figures.keys()
+    assert max(line.get_xdata().max() for line in figures["policy, first 4 s"].lines) == pytest.approx(4.0)
+    (circle,) = (patch for patch in figures["y (m)"].patches if patch.get_label() == "target")
+    assert (*circle.center, circle.radius) == (0.3, -0.1, 0.15)
+    assert figures["heading (rad)"].lines[-1].get_ydata()[0] == 2.0
+    way = figures["way to the target (m)"].lines[1]
+    q = shown[-1].episodes.q[0]
+    np.testing.assert_allclose(way.get_ydata(), np.hypot(q[:, 0] - 0.3, q[:, 1] + 0.1))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "shown"), [(SNAKEBOARD, (-0.8, None)), ("nhenv/SnakeboardVelocity-v0", (None, 2.8))]
+)
+def test_a_curve_is_shown_where_the_gaits_are(tmp_path, figures, env_id, shown):
+    """As far below the worst of all (above it, where less is better) as the best is from it."""
+    envs = make_envs(env_id, 1, backend="numpy")
+    two = [Shown("gait", GAITS[0], episodes(20, 50, envs)), Shown("policy", POLICY, episodes(30, 90, envs))]
+    metric = "distance_m" if env_id == SNAKEBOARD else "speed_error_mps"
+    values = (-3.0, 1.0) if env_id == SNAKEBOARD else (5.0, 1.0)
+    curve = [{"steps": i, "cpu_s": i, metric: value} for i, value in enumerate(values)]
+    draw(tmp_path / "figure.png", "title", envs, two, 0, [curve], {"worse": 0.1, "gait": 0.7, "other": 1.9})
+    (ax,) = (ax for name, ax in figures.items() if name in ("distance (m)", "speed error (m/s)"))
+    low, high = ax.get_ylim()
+    if shown[0] is not None:
+        assert low == pytest.approx(2 * 0.1 - 1.9)
+    else:
+        assert high == pytest.approx(2 * 1.9 - 0.1)
