@@ -10,13 +10,15 @@ frame of invariant vector fields neither do the generalized Christoffel symbols 
   may be computed at the identity x = y = heading = 0, which rids the algebra of the heading.
 
 The tests are numerical, at random points: an identity between analytic functions that holds there holds, with
-probability one, and every function of the language can be evaluated, whereas only some have a normal form.
+probability one, and every function of the language can be evaluated, whereas only some have a normal form. What is
+flat at these points and a wall elsewhere would pass: so no coordinate that the potential names is taken to be cyclic,
+no position that anything names to be free, and no heading that the potential names, unless with other angles.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -107,7 +109,9 @@ def cyclic_coordinates(mechanism: Mechanism, frame: Frame = None) -> tuple[str, 
     """
     probe = _Probe(mechanism, frame)
     amounts = probe.random(2)
-    return tuple(name for name in mechanism.coordinates if not probe.changes(probe.shift(name, amounts)))
+    named = _named(mechanism, [mechanism.potential])
+    free = (name for name in mechanism.coordinates if name not in named)
+    return tuple(name for name in free if not probe.changes(probe.shift(name, amounts)))
 
 
 def planar_symmetry(mechanism: Mechanism, frame: Frame = None) -> PlanarSymmetry | None:
@@ -120,7 +124,11 @@ def planar_symmetry(mechanism: Mechanism, frame: Frame = None) -> PlanarSymmetry
     x, y, *heading = mechanism.fibre or ("x", "y")
     if x not in mechanism.coordinates or y not in mechanism.coordinates:
         return None
-    probe = _Probe(mechanism, frame)
+    rows = [*mechanism.inertia, *mechanism.one_forms, *mechanism.forces.values()]
+    texts = [text for row in rows for text in row] + [mechanism.potential, mechanism.rayleigh]
+    if {x, y} & _named(mechanism, texts):
+        return None
+    probe, in_potential = _Probe(mechanism, frame), _named(mechanism, [mechanism.potential])
     others = [name for name in mechanism.coordinates if name not in (x, y)]
     # An invariant tensor has no Lie derivative along x∂y - y∂x + Σ t_c ∂_c, with t_c = 1 for what turns, else 0.
     rotation = probe.derivative(partial(probe.displace, x, y, ()))
@@ -130,6 +138,8 @@ def planar_symmetry(mechanism: Mechanism, frame: Frame = None) -> PlanarSymmetry
     must_turn = _solve(rotation, shifts)
     for name in heading or sorted(others, key=lambda c: c not in must_turn):
         turning = _solve(rotation + shifts[name], {c: column for c, column in shifts.items() if c != name})
+        if len({name, *turning} & in_potential) == 1:
+            continue
         if not probe.changes(probe.displace(x, y, (name, *turning), probe.random(math.pi), probe.random(2, 2))):
             index = mechanism.coordinates.index
             return PlanarSymmetry(index(x), index(y), index(name), tuple(map(index, turning)))
@@ -150,6 +160,15 @@ def find_fibre(mechanism: Mechanism, frame: Frame = None) -> tuple[str, ...]:
         return mechanism.fibre
     symmetry = planar_symmetry(mechanism, frame)
     return tuple(mechanism.coordinates[i] for i in (symmetry.x, symmetry.y, symmetry.heading)) if symmetry else ()
+
+
+def _named(mechanism: Mechanism, texts: Iterable[str]) -> set[str]:
+    """Names in texts, and in the definitions that these use."""
+    names = {name for text in texts for name in names_in(text)}
+    for name, text in reversed([*mechanism.definitions.items()]):  # one may use those before it
+        if name in names:
+            names |= names_in(text)
+    return names
 
 
 def _solve(constant: Array, columns: Mapping[str, Array]) -> tuple[str, ...]:

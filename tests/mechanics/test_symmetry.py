@@ -365,3 +365,31 @@ def test_cyclic_coordinates():
     assert cyclic_coordinates(body) == ("x", "y", "theta")
     assert cyclic_coordinates(body, "flat") == ("x", "y", "theta")
     assert cyclic_coordinates(body, "body") == ("x", "y")
+
+
+WALL = "(abs({0} - 5) + {0} - 5)**2"  # flat where symmetries are tried, and a wall behind
+
+
+@pytest.mark.parametrize("name", ["x", "y", "theta"])
+def test_what_is_flat_nearby_and_a_wall_elsewhere_breaks_the_symmetry(name):
+    sleigh = CATALOGUE["chaplygin_sleigh"]
+    assert planar_symmetry(sleigh) is not None
+    for spec in ({"potential": WALL.format(name)}, {"definitions": {"W": WALL.format(name)}, "potential": "3*W"}):
+        walled = changed(sleigh, **spec)
+        assert planar_symmetry(walled) is None
+        assert name not in cyclic_coordinates(walled)
+        motion = mechanics.simulate(walled, [0.0, 0.5], [5.5] * 3, qdot0=[0.0] * 3)
+        assert np.abs(motion.qdot[-1]).max() > 0.1  # pushed away
+        assert np.ptp(motion.energy) < 1e-9
+
+
+@pytest.mark.parametrize("part", ["inertia", "forces", "rayleigh"])
+def test_a_wall_in_another_part_breaks_it_too(part):
+    spec, wall = CATALOGUE["chaplygin_sleigh"].to_dict(), WALL.format("x")
+    if part == "inertia":
+        spec[part] = [[f"({text})*(1 + {wall})" for text in row] for row in spec[part]]
+    elif part == "forces":
+        spec[part] = {name: [f"({text})*(1 + {wall})" for text in row] for name, row in spec[part].items()}
+    else:
+        spec[part] = f"({spec[part]})*(1 + {wall})"
+    assert planar_symmetry(Mechanism.from_dict(spec)) is None
