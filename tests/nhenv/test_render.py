@@ -167,6 +167,12 @@ def test_the_mechanism_stays_in_the_picture(marker):
             assert (notes.discs[0][0] < SIZE).all()
 
 
+@pytest.mark.parametrize("far", [1.0, 1e6, 1e12, 1e200])
+def test_a_grid_has_few_lines_however_much_is_seen(far):
+    lines = painted(view_of("roller_racer", x=far, y=-far)).lines
+    assert 4 <= len(lines) < 40
+
+
 def test_a_marker_is_where_the_target_is():
     """In the coordinates in which the mechanism is drawn, with its radius and heading."""
     view = view_of("roller_racer", x=1.0, y=0.5, radius=0.2, heading=np.pi / 2)
