@@ -82,9 +82,9 @@ CONSTANTS: dict[str, np.float64] = {"pi": np.float64(np.pi)}
 
 _OPERATORS: dict[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _STRANGE = re.compile(r"[^A-Za-z0-9_.,+*/()\s-]", re.ASCII)
-# Generated code and SymPy's own call these functions by NumPy's names.
-# What generated functions call besides; their arguments have the names that users chose.
-_CALLED = ("either", "fma")
+# What generated functions call besides those of the language; their arguments have the names that users chose.
+_CALLED = ("either", "fabs", "fma")
+# Generated code and SymPy's own call the functions of the language by NumPy's names.
 _RESERVED = {*FUNCTIONS, *CONSTANTS, *(row[2].__name__ for row in FUNCTIONS.values()), *_CALLED}
 _MADE_OF = f"an expression is made of numbers, names, + - * / ** and {', '.join(FUNCTIONS)}"
 

@@ -195,6 +195,8 @@ class Mechanism:
     def resolve(self, params: Mapping[str, float] | None) -> dict[str, float]:
         """All parameters, defaults replaced by `params`; raise `MechanismError` for impossible ones."""
         values = dict(self.parameters)
+        if not isinstance(params, Mapping | None):
+            raise MechanismError(f"{self.name}: params must map parameters to numbers, got {params!r}")
         for name, value in (params or {}).items():
             if name not in values:
                 raise MechanismError(f"{self.name}: {unknown_name('parameter', str(name), values)}")

@@ -59,10 +59,12 @@ class Model:
 
     def feasible(self, q: ArrayLike, qdot: ArrayLike) -> Array:
         """Pseudo-velocities v (..., k) of q̇ (..., n); raise `MechanismError` where q̇ is not in D."""
-        v = self.project(q, qdot)
-        given, projected = np.asarray(qdot, dtype=float), self.velocity(q, v)
-        error = np.linalg.norm(given - projected, axis=-1)
-        if not (error <= CONSTRAINT_TOLERANCE * np.maximum(1.0, np.linalg.norm(given, axis=-1))).all():
+        with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
+            v = self.project(q, qdot)
+            given, projected = np.asarray(qdot, dtype=float), self.velocity(q, v)
+            error = np.linalg.norm(given - projected, axis=-1)
+            allowed = CONSTRAINT_TOLERANCE * np.maximum(1.0, np.linalg.norm(given, axis=-1))
+        if not (np.isfinite(allowed) & (error <= allowed)).all():
             raise MechanismError(
                 f"{self.mechanism.name}: qdot = {given.tolist()} violates the rolling constraints by "
                 f"{np.max(error):.3g}; the nearest feasible velocity is {projected.tolist()}"

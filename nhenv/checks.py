@@ -19,8 +19,8 @@ def number(name: str, value: Any) -> float:
     """A number, perhaps not finite."""
     try:
         return float(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be a number, got {reprlib.repr(value)}") from None
 
 
 def positive(name: str, value: Any) -> float:
@@ -42,8 +42,8 @@ def array(what: str, value: Any, shape: tuple[int, ...], mask: NDArray[np.bool_]
     """An array of finite numbers of this shape; or with a mask, perhaps one for each row, of the rows in it."""
     try:
         result = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} must be a number or an array of numbers, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{what} must be a number or an array of numbers, got {reprlib.repr(value)}") from None
     shapes = [shape] if mask is None else [shape, (len(mask), *shape)]
     if result.shape not in shapes:
         raise ValueError(f"{what} must have shape {' or '.join(map(str, shapes))}, got {result.shape}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import reprlib
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, TypeVar
@@ -109,10 +110,10 @@ class Configuration:
     def numbers(self, params: Mapping[str, float], drag: Mapping[str, float] | None) -> dict[str, float]:
         """A value for each of the scene's parameters, for these parameters and drag coefficients of the mechanism."""
         forward = self.mechanism.direction(params)
-        if forward == 0:
+        if forward not in (1, -1):
             raise ValueError(
-                f"{self.mechanism.name}: with these parameters {self.mechanism.forward} = 0, and its gaits drive it "
-                "neither way; change a parameter"
+                f"{self.mechanism.name}: with these parameters {self.mechanism.forward} = {forward:g}, and its gaits "
+                "drive it neither way; change a parameter"
             )
         return {**self.weights, **params, "dt": self.dt, "forward": forward, **(drag or {})}
 
@@ -210,9 +211,14 @@ class Configuration:
                     raise ValueError(f"torque_limits: {unknown_name('control', str(name), controls)}")
                 values[name] = value
         elif given is not None:
-            array = np.asarray(given, dtype=float)
+            try:
+                array = np.asarray(given, dtype=float)
+            except (TypeError, ValueError, OverflowError):
+                array = np.empty((0,))
             if array.shape not in ((), (len(controls),)):
-                raise ValueError(f"torque_limits must be one number for each of {', '.join(controls)}, got {given!r}")
+                raise ValueError(
+                    f"torque_limits must be one number for each of {', '.join(controls)}, got {reprlib.repr(given)}"
+                )
             values = dict(zip(controls, np.broadcast_to(array, len(controls)), strict=True))
         return np.array([checks.positive(f"torque limit of {name}", value) for name, value in values.items()])
 

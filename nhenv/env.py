@@ -200,7 +200,8 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: Options | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode at rest near the origin, or at `options` "q" and "qdot", for the `options` "target"."""
-        super().reset(seed=seed)
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"reset options must be a dictionary, got {options!r}")
         for key in options or {}:
             if key not in ("q", "qdot", "target"):
                 raise ValueError(f"reset options: {unknown_name('option', str(key), ('q', 'qdot', 'target'))}")
@@ -211,14 +212,18 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             start = self._configuration.state_given(options, "q")
             self._configuration.check_stops(start)
             values[len(self.task.targets) :] = start[self._scene.start_places]
+        qdot = self._configuration.state_given(options, "qdot") if options and "qdot" in options else None
+        if start is not None and qdot is not None:
+            self._model.feasible(start, qdot)  # what is refused changes nothing
+        super().reset(seed=seed)
         drawn = self.np_random.random(self._scene.draws)
         begun = self._scene.kernel.begin(drawn, self.reset_noise_scale, np.array(values), self._constants(self._blank))
         q, v = np.zeros(self.mechanism.n), np.zeros(self.mechanism.rank)
         q[self._noisy] = begun[: len(self._noisy)]
         if start is not None:
             q = start
-        if options and "qdot" in options:
-            v = self._model.feasible(q, self._configuration.state_given(options, "qdot"))
+        if qdot is not None:
+            v = self._model.feasible(q, qdot)
         self._memory, self._start = self._blank.copy(), (q, v)
         self._targets = dict(zip(self._scene.targets, map(float, begun[len(self._noisy) :]), strict=True))
         self._scene.put(self._memory, q, v)

@@ -363,7 +363,7 @@ def _scope(scene: Scene, equations: ReducedEquations, actions: list[sp.Symbol]) 
         scope |= roles
     words = (*task.weights, *task.targets, *task.definitions) if task else ()
     for name in (*words, "dt", "forward", "effort", "terminated"):
-        if name in (*mechanism.coordinates, *mechanism.parameters, *mechanism.drag):
+        if name in (*mechanism.coordinates, *mechanism.parameters, *mechanism.drag, *mechanism.controls):
             raise ExpressionError(f"{mechanism.name} has its own {name!r}, a word that tasks use; rename it")
     return scope | {name: sp.Symbol(name) for name in (task.targets if task else ())}
 

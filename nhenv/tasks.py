@@ -25,6 +25,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from numbers import Real
 from typing import Any
 
 from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name, wrong_keys
@@ -76,6 +77,12 @@ class Task:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not re.fullmatch(r"[A-Z][A-Za-z0-9]*", self.name):
             raise ValueError(f"a task's name must be CamelCase letters and digits, as in an id, got {self.name!r}")
+        for kind in ("observation", "reward", "info", "weights", "targets", "definitions", "marker"):
+            if not isinstance(getattr(self, kind), Mapping):
+                raise ValueError(f"task {self.name!r}: {kind} must be a dictionary, got {getattr(self, kind)!r}")
+        for name, value in self.weights.items():
+            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+                raise ValueError(f"task {self.name!r}: weight {name!r} must be a finite number, got {value!r}")
         self._check_names()
         for name, rule in self.targets.items():
             if not isinstance(rule, str) and not _is_interval(rule):
@@ -94,11 +101,15 @@ class Task:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Task:
         """Build a task from plain data, such as `dataclasses.asdict` of one, or that read back from JSON."""
+        if not isinstance(data, Mapping):
+            raise ValueError(f"a task's spec must be a dictionary, got {data!r}")
         known, required = [f.name for f in fields(cls)], ("name", "reward", "max_episode_steps")
         if problem := wrong_keys(data, known, required, "a task's spec"):
             raise ValueError(problem)
-        rules = {name: tuple(r) if isinstance(r, list) else r for name, r in data.get("targets", {}).items()}
-        return cls(**{**data, "targets": rules})
+        targets = data.get("targets", {})
+        if isinstance(targets, Mapping):
+            targets = {name: tuple(rule) if isinstance(rule, list) else rule for name, rule in targets.items()}
+        return cls(**{**data, "targets": targets})
 
     def to_dict(self, *, drawing: bool = True) -> dict[str, Any]:
         """Plain data of this task; `from_dict` makes an equal one of it.
@@ -181,7 +192,7 @@ def _is_interval(rule: Any) -> bool:
         low, high = map(float, rule)
     except (TypeError, ValueError):
         return False
-    return math.isfinite(low) and math.isfinite(high) and low <= high
+    return low <= high and math.isfinite(high - low)
 
 
 # -- what tasks have in common that lead to a place, or to a place and a heading there -------------

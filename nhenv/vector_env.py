@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
@@ -162,7 +163,9 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
         self, *, seed: Seeds = None, options: Mapping[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], Infos]:
         """Start an episode in every row, or in those of `options` "reset_mask"."""
-        options = options or {}
+        options = {} if options is None else options
+        if not isinstance(options, Mapping):
+            raise ValueError(f"reset options must be a dictionary, got {options!r}")
         for key in options:
             if key not in _OPTIONS:
                 raise ValueError(f"reset options: {unknown_name('option', str(key), _OPTIONS)}")
@@ -286,6 +289,9 @@ class LocomotionVectorEnv(gym.vector.VectorEnv[NDArray[np.float32], NDArray[np.f
     def elapsed_steps(self, steps: ArrayLike) -> None:
         """Say how long the present episodes have lasted; the time limit comes that much sooner."""
         self._require_start()
+        whole = np.asarray(steps)
+        if not np.issubdtype(whole.dtype, np.integer) or (whole < 0).any():
+            raise ValueError(f"elapsed_steps must be whole numbers that are not negative, got {reprlib.repr(steps)}")
         self._memory.put("steps__p", np.arange(self.num_envs), np.broadcast_to(steps, self.num_envs))
 
     @property

@@ -271,6 +271,7 @@ HOSTILE = {
     "a staged name": (sleigh(parameters={"m": 2.0, "J": 0.5, "x__2": 1.0}), "kept for generated names"),
     "a rate": (sleigh(parameters={"m": 2.0, "J": 0.5, "x_dot": 1.0}), "ending _dot is kept"),
     "a function's name": (sleigh(parameters={"m": 2.0, "J": 0.5, "tanh": 1.0}), "reserved word"),
+    "a name that generated code calls": (sleigh(parameters={"m": 2.0, "J": 0.5, "fabs": 1.0}), "reserved word"),
     "NumPy's name of a function": (sleigh(parameters={"m": 2.0, "J": 0.5, "arctan2": 1.0}), "reserved word"),
     "a function without arguments": (sleigh(potential="sin + 1"), "'sin' is not allowed"),
     "control characters": (sleigh(citation="\x1b[2J"), "cannot be printed"),

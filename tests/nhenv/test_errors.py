@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import mechanics
 import nhenv
 from mechanics.mechanism import MechanismError
 from nhenv.env import LocomotionEnv
@@ -24,6 +25,10 @@ def _message(error, *words):
     text = str(error.value)
     missing = [word for word in words if word not in text]
     assert not missing, f"{missing} not in {text!r}"
+
+
+def _sleigh(**spec):
+    return {**mechanics.get("chaplygin_sleigh").to_dict(), **spec}
 
 
 # -- arguments ----------------------------------------------------------------------------------
@@ -85,6 +90,16 @@ ARGUMENTS = {
     "picture too small": (RACER, {"render_size": (640, 16)}, ValueError, ["render_size", "32 to 2048", "(640, 16)"]),
     "picture too large": (RACER, {"render_size": (640, 5000)}, ValueError, ["render_size", "32 to 2048", "5000"]),
     "picture of half a pixel": (RACER, {"render_size": (640, 40.5)}, ValueError, ["height", "whole", "40.5"]),
+    "parameters bare": (RACER, {"params": [1.0]}, MechanismError, ["params", "map parameters to numbers", "[1.0]"]),
+    "torque limits no numbers": (RACER, {"torque_limits": "a"}, ValueError, ["torque_limits", "u_psi", "'a'"]),
+    "torque limits ragged": (SNAKEBOARD, {"torque_limits": [1, [2]]}, ValueError, ["torque_limits", "u_psi", "[2]"]),
+    "dt beyond floats": (RACER, {"dt": 10**400}, ValueError, ["dt", "number", "1000"]),
+    "a weight with a control's name": (
+        SNAKEBOARD,
+        {"task": {"name": "Own", "reward": {"r": "u_psi"}, "weights": {"u_psi": 5.0}, "max_episode_steps": 9}},
+        ValueError,
+        ["'u_psi'", "rename it"],
+    ),
     "joint limit bare": (RACER, {"joint_limits": 1.0}, ValueError, ["joint_limits", "True, False", "1.0"]),
 }  # fmt: skip
 
@@ -154,12 +169,21 @@ def test_reset_beyond_a_stop(env):
     _message(error, joint, str(limit), "joint_limits=False")
 
 
-def test_reset_with_a_velocity_that_slips(env):
+@pytest.mark.parametrize("speed", [0.5, 1e160])  # the square of the second is too large for a float
+def test_reset_with_a_velocity_that_slips(env, speed):
     qdot = np.zeros(env.mechanism.n)
-    qdot[1] = 0.5  # sideways, and every wheel points along x
+    qdot[1] = speed  # sideways, and every wheel points along x
     with pytest.raises(MechanismError, match="violates the rolling constraints") as error:
         env.reset(options={"q": np.zeros(env.mechanism.n), "qdot": qdot})
-    _message(error, "0.5", "nearest feasible velocity")
+    _message(error, str(speed), "nearest feasible velocity")
+
+
+@pytest.mark.parametrize("options", [3, "q", ["q"]])
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+def test_reset_options_that_are_no_dictionary(make, options):
+    env = make(SNAKEBOARD, backend="numpy")
+    with pytest.raises(ValueError, match="reset options must be a dictionary, got"):
+        env.unwrapped.reset(options=options)
 
 
 def test_a_refused_reset_leaves_the_episode_as_it_was(env):
@@ -168,6 +192,19 @@ def test_a_refused_reset_leaves_the_episode_as_it_was(env):
     with pytest.raises(ValueError, match="reset option"):
         env.reset(options={"q": [0]})
     assert np.array_equal(env.q, before)
+
+
+@pytest.mark.parametrize("options", [{"foo": 1}, {"q": [0]}, "slips"])
+def test_a_refused_reset_draws_nothing(env, options):
+    if options == "slips":
+        options = {"q": np.zeros(env.mechanism.n), "qdot": np.eye(env.mechanism.n)[1]}
+    env.reset(seed=0)
+    state = env.np_random.bit_generator.state
+    for seed in (None, 5):
+        with pytest.raises(ValueError, match="reset option|violates"):
+            env.reset(seed=seed, options=options)
+        assert env.np_random.bit_generator.state == state
+    assert env.np_random_seed == 0
 
 
 # -- step ---------------------------------------------------------------------------------------
@@ -306,3 +343,25 @@ def test_stepping_on_after_divergence_is_safe_at_any_time(steps, kernel_cache):
 
 def test_ids_of_this_file_are_registered():
     assert {SNAKEBOARD, RACER} <= set(nhenv.environment_ids())
+
+
+def test_a_forward_that_is_no_number():
+    with pytest.raises(ValueError, match="neither way") as error:
+        gym.make("nhenv/ChaplyginSleighForward-v0", mechanism=_sleigh(forward="sqrt(m - 2)"))
+    _message(error, "sqrt(m - 2) = nan", "change a parameter")
+
+
+def test_a_control_with_a_name_that_tasks_use():
+    with pytest.raises(ValueError, match="'dt'") as error:
+        gym.make("nhenv/ChaplyginSleighForward-v0", mechanism=_sleigh(forces={"dt": ["0", "0", "1"]}, torque_limits={}))
+    _message(error, "rename it")
+
+
+def test_elapsed_steps_are_counts():
+    envs = gym.make_vec(SNAKEBOARD, 2, backend="numpy").unwrapped
+    envs.reset(seed=0)
+    envs.elapsed_steps = [3, 4]
+    for steps in (-5, np.nan, [1, -1], 2.5):
+        with pytest.raises(ValueError, match="whole numbers that are not negative"):
+            envs.elapsed_steps = steps
+    assert envs.elapsed_steps.tolist() == [3, 4]

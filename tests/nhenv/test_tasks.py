@@ -561,3 +561,28 @@ def test_tasks_that_do_not_fit_a_mechanism(make_task, change, words):
     with pytest.raises((ValueError, ExpressionError)) as error:
         make_task("snakeboard", Task.from_dict({**BASE, **change}))
     assert not [word for word in words if word not in str(error.value)]
+
+
+@pytest.mark.parametrize("kind", ["observation", "reward", "info", "weights", "targets", "definitions", "marker"])
+@pytest.mark.parametrize("value", [3, "x", ["x"], None])
+def test_parts_of_a_task_are_dictionaries(kind, value):
+    spec = {"name": "Own", "reward": {"r": "effort"}, "max_episode_steps": 9, kind: value}
+    for make in (lambda: Task(**spec), lambda: Task.from_dict(spec)):
+        with pytest.raises(ValueError, match=f"task 'Own': {kind} must be a dictionary, got"):
+            make()
+
+
+def test_the_spec_of_a_task_is_a_dictionary():
+    with pytest.raises(ValueError, match="a task's spec must be a dictionary, got None"):
+        Task.from_dict(None)
+
+
+@pytest.mark.parametrize("value", ["3", None, math.nan, math.inf, True])
+def test_weights_are_finite_numbers(value):
+    with pytest.raises(ValueError, match="task 'Own': weight 'w' must be a finite number, got"):
+        Task(name="Own", reward={"r": "effort"}, weights={"w": value}, max_episode_steps=9)
+
+
+def test_an_interval_as_wide_as_no_float_is_refused():
+    with pytest.raises(ValueError, match="target 'a' must be"):
+        Task(name="Own", reward={"r": "effort"}, targets={"a": (-1e308, 1e308)}, max_episode_steps=9)
