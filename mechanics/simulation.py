@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -98,8 +101,16 @@ def simulate(
         v = model.feasible(q, _vector(mechanism, qdot0, n, "qdot0"))
     states = np.empty((len(times), n + k + 1))
     states[0] = np.concatenate([q, v, [0.0]])
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if not isinstance(value, Real) or not (math.isfinite(value) and value > 0):
+            raise MechanismError(f"{name} must be a positive finite number, got {value!r}")
     rtol, atol = max(rtol / SAFETY, SMALLEST_TOLERANCE), atol / SAFETY
+    if controls is not None and not callable(controls):
+        raise MechanismError(f"{mechanism.name}: controls must be a function of the time, got {controls!r}")
     torque = None if controls is None else _checked(mechanism, controls)
+    if torque is not None and not mechanism.forces:
+        torque(times[0])
+        torque = None  # nothing of which jumps could be looked for
     with np.errstate(all="ignore"):  # what is not finite is found and named
         for index, (start, end) in enumerate(zip(times[:-1], times[1:], strict=True)):
             states[index + 1] = _integrate(model, torque, start, end, states[index], rtol, atol)
@@ -157,11 +168,16 @@ def _checked(mechanism: Mechanism, controls: Callable[[float], ArrayLike]) -> To
     m = len(mechanism.forces)
 
     def torque(time: float) -> Array:
-        value = np.asarray(controls(time), dtype=float)
+        given = controls(time)
+        try:
+            value = np.asarray(given, dtype=float)
+        except (TypeError, ValueError, OverflowError):
+            value = np.array(np.nan)
         if value.shape != (m,) or not np.isfinite(value).all():
             names = ", ".join(mechanism.controls)
             raise MechanismError(
-                f"{mechanism.name}: controls({time:.6g}) must be {m} finite number(s) ({names}), got {value.tolist()}"
+                f"{mechanism.name}: controls({time:.6g}) must be {m} finite number(s) ({names}), "
+                f"got {reprlib.repr(given)}"
             )
         return value
 
@@ -169,14 +185,20 @@ def _checked(mechanism: Mechanism, controls: Callable[[float], ArrayLike]) -> To
 
 
 def _times(t: ArrayLike) -> Array:
-    times = np.asarray(t, dtype=float)
+    try:
+        times = np.asarray(t, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise MechanismError(f"t must be a row of increasing finite times, got {reprlib.repr(t)}") from None
     if times.ndim != 1 or len(times) < 1 or not np.isfinite(times).all() or not (np.diff(times) > 0).all():
         raise MechanismError(f"t must be a row of increasing finite times, got {np.array2string(times, threshold=6)}")
     return times
 
 
 def _vector(mechanism: Mechanism, value: ArrayLike, size: int, label: str) -> Array:
-    vector = np.array(value, dtype=float)
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise MechanismError(f"{mechanism.name}: {label} must be {size} numbers, got {reprlib.repr(value)}") from None
     if vector.shape != (size,):
         raise MechanismError(f"{mechanism.name}: {label} must have shape ({size},), got {vector.shape}")
     if not np.isfinite(vector).all():

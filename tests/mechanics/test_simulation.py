@@ -112,7 +112,18 @@ def test_the_pole_of_a_frame_is_named():
     [
         ({"t": [0.0, 0.0]}, "increasing"),
         ({"t": [0.0, np.nan]}, "finite"),
+        ({"t": "soon"}, "t must be a row of increasing finite times, got 'soon'"),
+        ({"t": [[0.0], [1.0, 2.0]]}, "t must be a row"),
         ({"q0": [0.0] * 4}, r"q0 must have shape \(5,\)"),
+        ({"q0": "here"}, "q0 must be 5 numbers, got 'here'"),
+        ({"qdot0": [10**400] * 5}, "qdot0 must be 5 numbers"),
+        ({"rtol": -1e-9}, "rtol must be a positive finite number, got -1e-09"),
+        ({"rtol": "fine"}, "rtol must be a positive finite number, got 'fine'"),
+        ({"atol": 0.0}, "atol must be a positive finite number, got 0.0"),
+        ({"atol": np.nan}, "atol must be a positive finite number, got nan"),
+        ({"controls": [0.0, 0.0]}, "controls must be a function of the time"),
+        ({"controls": lambda t: "x"}, r"controls\(0\) must be 2 finite number\(s\) \(u_psi, u_phi\), got 'x'"),
+        ({"controls": lambda t: [1j, 0.0]}, "finite"),
         ({"q0": [0.0, 0, 0, 0, np.inf]}, "finite"),
         ({"qdot0": [0.0, 1.0, 0, 0, 0]}, "nearest feasible velocity"),
         ({"v0": [0.0] * 3, "qdot0": [0.0] * 5}, "not both"),
@@ -127,6 +138,16 @@ def test_bad_input(change, words):
     arguments = {"t": [0.0, 1.0], "q0": [0.0] * 5, **change}
     with pytest.raises(mechanics.MechanismError, match=words):
         mechanics.simulate(mechanics.get("snakeboard"), **arguments)
+
+
+def test_controls_of_what_has_none():
+    sleigh = mechanics.get("chaplygin_sleigh").to_dict() | {"forces": {}, "torque_limits": {}}
+    free = mechanics.Mechanism.from_dict(sleigh)
+    start = {"t": [0.0, 1.0], "q0": [0.0] * 3, "v0": [1.0, 0.5]}
+    still, given = mechanics.simulate(free, **start), mechanics.simulate(free, **start, controls=lambda t: [])
+    assert np.array_equal(still.q, given.q)
+    with pytest.raises(mechanics.MechanismError, match="must be 0 finite"):
+        mechanics.simulate(free, **start, controls=lambda t: [1.0])
 
 
 def test_numbers_in_numbers_out(record):
