@@ -28,7 +28,16 @@ from dataclasses import asdict, dataclass, field, fields
 from numbers import Real
 from typing import Any
 
-from mechanics.expressions import ExpressionError, check_name, names_in, unknown_name, wrong_keys
+from mechanics.expressions import (
+    QUANTITY,
+    ExpressionError,
+    Extent,
+    check_name,
+    extent,
+    names_in,
+    unknown_name,
+    wrong_keys,
+)
 from mechanics.mechanism import Mechanism
 
 __all__ = ["MARKER", "POSE", "START", "TASKS", "Task", "get"]
@@ -168,8 +177,12 @@ class Task:
                 for unknown in (names_in(rule) if isinstance(rule, str) else set()) - {*earlier, *START}:
                     raise ExpressionError(unknown_name("target", unknown, (*earlier, *START)))
                 earlier.append(name)
-            for kind, text in self._texts():  # noqa: B007 (named in the error)
-                names_in(text)
+            extents: dict[str, Extent] = {}
+            for kind, text in self._texts():
+                known = {name: extents.get(name.removesuffix("_before"), QUANTITY) for name in names_in(text)}
+                size = extent(text, known)
+                if kind.startswith("definitions, "):
+                    extents[kind.partition(", ")[2]] = size
         except ExpressionError as error:
             raise ExpressionError(f"task {self.name!r}, {kind}: {error}") from None
 

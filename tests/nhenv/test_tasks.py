@@ -586,3 +586,16 @@ def test_weights_are_finite_numbers(value):
 def test_an_interval_as_wide_as_no_float_is_refused():
     with pytest.raises(ValueError, match="target 'a' must be"):
         Task(name="Own", reward={"r": "effort"}, targets={"a": (-1e308, 1e308)}, max_episode_steps=9)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        {"reward": {"r": "d20"}, "definitions": {"d0": "x"} | {f"d{i + 1}": f"d{i}*d{i} + d{i}" for i in range(20)}},
+        {"reward": {"r": "((((9.7**16)**16)**16)**16)**16"}},
+        {"reward": {"r": "effort"}, "terminated": "(((x**16)**16)**16)**16"},
+    ],
+)
+def test_expressions_that_nobody_could_work_with_are_refused_at_once(spec):
+    with pytest.raises(ExpressionError, match="task 'Own', .* is too large"):
+        Task(name="Own", max_episode_steps=9, **spec)
