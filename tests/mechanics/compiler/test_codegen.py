@@ -169,22 +169,22 @@ def test_the_generators_own_names_are_out_of_reach(equations, rates_of, stepper)
     assert {name for name in invented if "__" not in name and not name.startswith("_")} == set()
 
 
-HOSTILE = ("h", "k", "s", "f", "p", "e", "inf", "fabs", "copysign", "isfinite", "constants", "step", "new")
+HOSTILE = ("h", "k", "s", "f", "p", "e", "inf", "floor", "copysign", "isfinite", "constants", "step", "new")
 
 
 def test_hostile_names_change_nothing(build, stepper):
     """States and parameters may have the names that a careless generator would use itself."""
     for name in HOSTILE:
         check_name(name, "coordinate")
-    h, k, s, f, p, inf, fabs = sp.symbols("h k s f p inf fabs")
-    hostile = {h: k, k: -sp.sin(h) * p, s: sp.Abs(h) * inf + fabs * sp.cos(f), f: h * p}
-    tame = {old: sp.Symbol(f"t{i}") for i, old in enumerate((h, k, s, f, p, inf, fabs))}
+    h, k, s, f, p, inf, floor = sp.symbols("h k s f p inf floor")
+    hostile = {h: k, k: -sp.sin(h) * p, s: sp.Abs(h) * inf + floor * sp.cos(f), f: h * p}
+    tame = {old: sp.Symbol(f"t{i}") for i, old in enumerate((h, k, s, f, p, inf, floor))}
     plain = {tame[state]: rate.xreplace(tame) for state, rate in hostile.items()}
     values = (0.7, 1.3, 0.9)
     start = dict(zip(hostile, (0.4, 0.1, -0.3, 0.8), strict=True))
-    _, one = stepper(hostile, list(hostile), "rk4", parameters=dict(zip((p, inf, fabs), values, strict=True)))
+    _, one = stepper(hostile, list(hostile), "rk4", parameters=dict(zip((p, inf, floor), values, strict=True)))
     _, two = stepper(
-        plain, list(plain), "rk4", parameters=dict(zip((tame[p], tame[inf], tame[fabs]), values, strict=True))
+        plain, list(plain), "rk4", parameters=dict(zip((tame[p], tame[inf], tame[floor]), values, strict=True))
     )
     first = one(0.1, start)
     second = two(0.1, {tame[state]: value for state, value in start.items()})
