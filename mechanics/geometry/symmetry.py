@@ -125,6 +125,7 @@ def planar_symmetry(mechanism: Mechanism, frame: Frame = None) -> PlanarSymmetry
     if x not in mechanism.coordinates or y not in mechanism.coordinates:
         return None
     rows = [*mechanism.inertia, *mechanism.one_forms, *mechanism.forces.values()]
+    rows += (frame is not None and mechanism.frame_rows(frame)) or ()
     texts = [text for row in rows for text in row] + [mechanism.potential, mechanism.rayleigh]
     if {x, y} & _named(mechanism, texts):
         return None

@@ -393,3 +393,10 @@ def test_a_wall_in_another_part_breaks_it_too(part):
     else:
         spec[part] = f"({spec[part]})*(1 + {wall})"
     assert planar_symmetry(Mechanism.from_dict(spec)) is None
+
+
+def test_a_wall_in_a_frame_breaks_it_too():
+    sleigh, wall = CATALOGUE["chaplygin_sleigh"], WALL.format("x")
+    rows = [[f"({text})*(1 + {wall})" for text in row] for row in sleigh.frame_rows(next(iter(sleigh.frames)))]
+    assert planar_symmetry(sleigh, sleigh.frame_rows(next(iter(sleigh.frames)))) is not None
+    assert planar_symmetry(sleigh, rows) is None
