@@ -165,16 +165,12 @@ def _integrate(
 
 def _checked(mechanism: Mechanism, controls: Callable[[float], ArrayLike]) -> Torque:
     """Controls as arrays whose shape is checked at every call."""
-    m = len(mechanism.forces)
+    m, names = len(mechanism.forces), ", ".join(mechanism.controls)
 
     def torque(time: float) -> Array:
         given = controls(time)
-        try:
-            value = np.asarray(given, dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            value = np.array(np.nan)
-        if value.shape != (m,) or not np.isfinite(value).all():
-            names = ", ".join(mechanism.controls)
+        value = _floats(given)
+        if value is None or value.shape != (m,) or not np.isfinite(value).all():
             raise MechanismError(
                 f"{mechanism.name}: controls({time:.6g}) must be {m} finite number(s) ({names}), "
                 f"got {reprlib.repr(given)}"
@@ -184,21 +180,31 @@ def _checked(mechanism: Mechanism, controls: Callable[[float], ArrayLike]) -> To
     return torque
 
 
-def _times(t: ArrayLike) -> Array:
+def _floats(value: Any) -> Array | None:
+    """A copy of `value` as floats, or None if that is not possible."""
     try:
-        times = np.asarray(t, dtype=float)
+        return np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise MechanismError(f"t must be a row of increasing finite times, got {reprlib.repr(t)}") from None
-    if times.ndim != 1 or len(times) < 1 or not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-        raise MechanismError(f"t must be a row of increasing finite times, got {np.array2string(times, threshold=6)}")
+        return None
+
+
+def _times(t: ArrayLike) -> Array:
+    times = _floats(t)
+    if (
+        times is None
+        or times.ndim != 1
+        or len(times) < 1
+        or not np.isfinite(times).all()
+        or not (np.diff(times) > 0).all()
+    ):
+        raise MechanismError(f"t must be a row of increasing finite times, got {reprlib.repr(t)}")
     return times
 
 
 def _vector(mechanism: Mechanism, value: ArrayLike, size: int, label: str) -> Array:
-    try:
-        vector = np.array(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise MechanismError(f"{mechanism.name}: {label} must be {size} numbers, got {reprlib.repr(value)}") from None
+    vector = _floats(value)
+    if vector is None:
+        raise MechanismError(f"{mechanism.name}: {label} must be {size} numbers, got {reprlib.repr(value)}")
     if vector.shape != (size,):
         raise MechanismError(f"{mechanism.name}: {label} must have shape ({size},), got {vector.shape}")
     if not np.isfinite(vector).all():
