@@ -213,17 +213,18 @@ class LocomotionEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._configuration.check_stops(start)
             values[len(self.task.targets) :] = start[self._scene.start_places]
         qdot = self._configuration.state_given(options, "qdot") if options and "qdot" in options else None
-        if start is not None and qdot is not None:
-            self._model.feasible(start, qdot)  # what is refused changes nothing
+        v = np.zeros(self.mechanism.rank)
+        if start is not None and qdot is not None:  # here already: what is refused draws nothing
+            v = self._model.feasible(start, qdot)
         super().reset(seed=seed)
         drawn = self.np_random.random(self._scene.draws)
         begun = self._scene.kernel.begin(drawn, self.reset_noise_scale, np.array(values), self._constants(self._blank))
-        q, v = np.zeros(self.mechanism.n), np.zeros(self.mechanism.rank)
-        q[self._noisy] = begun[: len(self._noisy)]
-        if start is not None:
-            q = start
-        if qdot is not None:
-            v = self._model.feasible(q, qdot)
+        q = start
+        if q is None:
+            q = np.zeros(self.mechanism.n)
+            q[self._noisy] = begun[: len(self._noisy)]
+            if qdot is not None:
+                v = self._model.feasible(q, qdot)
         self._memory, self._start = self._blank.copy(), (q, v)
         self._targets = dict(zip(self._scene.targets, map(float, begun[len(self._noisy) :]), strict=True))
         self._scene.put(self._memory, q, v)

@@ -19,7 +19,7 @@ from mechanics.placing import Placed, place
 from nhenv.canvas import Canvas, Colour, Window, pygame_module
 from nhenv.tasks import Task
 
-__all__ = ["COLOURS", "Projection", "Screen", "View", "marker_of"]
+__all__ = ["COLOURS", "Projection", "Screen", "View", "grid_step", "marker_of"]
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ WHITE: Colour = (255, 255, 255)
 SHARE = 0.24  # of the picture's height (or 5/8 of its width) that the mechanism takes
 FOLLOWING = 2.5  # rad/s: the camera follows what changes more slowly, and not each swing
 MARGIN = 1.3  # of the part of the plane that is shown with a target, over what must be seen
-GRID_STEPS = tuple(digit * 10.0**power for power in range(-1, 300) for digit in (1, 2, 5))
+LEAST_STEP = 0.1  # smallest distance of two lines of the grid, in m
 SPACING = 80.0  # smallest distance of two lines of the grid, in pixels
 WORDS = 52.0  # height of the words at the top, in pixels
 TRAIL_PARTS = 4  # straight parts of the trail between two states, which are some 0.2 m apart at full speed
@@ -140,7 +140,7 @@ class View:
         return Projection(middle, scale, (canvas.width, canvas.height), above)
 
     def _paint_grid(self, canvas: Canvas, place_of: Projection) -> None:
-        step = next((step for step in GRID_STEPS if step * place_of.scale >= SPACING), GRID_STEPS[-1])
+        step = grid_step(SPACING / place_of.scale)
         (left, bottom), (right, top) = place_of.corners
         for axis, (low, high) in enumerate(((left, right), (bottom, top))):
             for i in range(math.ceil(low / step), math.floor(high / step) + 1):
@@ -294,6 +294,12 @@ class Screen:
     def __getstate__(self) -> dict[str, Any]:
         """Everything but canvas and window, which are made again."""
         return {**self.__dict__, "_canvas": None, "_window": None}
+
+
+def grid_step(least: float) -> float:
+    """Distance of two lines, in m: the first of 0.1, 0.2, 0.5, 1, 2, 5, ... that is not below `least`."""
+    power = 10.0 ** math.floor(math.log10(max(least, LEAST_STEP)))
+    return next(step * power for step in (1, 2, 5, 10) if step * power >= least)
 
 
 def marker_of(task: Task, numbers: Mapping[str, float]) -> dict[str, float]:

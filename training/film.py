@@ -140,7 +140,7 @@ class _Strip:
             return left + (right - left) * (way - self._low) / (self._high - self._low)
 
         canvas.line([(left, y), (right, y)], 3.0, render.AXES)
-        step = next(s for s in (*render.GRID_STEPS, math.inf) if s * (right - left) >= 60 * (self._high - self._low))
+        step = render.grid_step(60 * (self._high - self._low) / (right - left))
         for i in range(math.ceil(self._low / step), math.floor(self._high / step) + 1):
             canvas.line([(place(i * step), y - 5), (place(i * step), y + 5)], 2.0, render.AXES)
             canvas.text(f"{i * step:g} m", place(i * step), y + 14, 18, render.FAINT, "midtop")
